@@ -21,6 +21,7 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import runs
+from diransac.identification.regression.uncertainty import robust_std
 from diransac.identification.serialization import Masks, Number, Numbers, Series, Values, WholeNumbers
 
 __all__ = ["Departure", "Diagnosis", "HausmanTest", "Outcome", "Resolution", "departures"]
@@ -233,18 +234,11 @@ _LENGTH = 8
 _FEWEST = 5 * _LENGTH
 
 
-_NORMAL = 1.4826
-
-
 _FAR, _OWN = 6.0, 3.0
 """RMS of a stretch, and size within it, over the scale of the log.
 
 Of one log of each regime of the robustness benchmark, those of saturated and of wrong inputs alone exceed it.
 """
-
-
-_MATERIAL = 0.3
-"""RMS of a stretch over that of the accelerations by the model."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +281,8 @@ def departures(diagnosis: Diagnosis, log: int, unexplained: Mapping[str, float])
             continue
         scale = _scale(values)
         modelled = float(np.sqrt(np.mean(np.square(values)))) * (1.0 - share) / share
-        far = (ratio > _FAR) & (ratio * scale > _MATERIAL * modelled)
+        # A stretch must be material beside the accelerations by the model, too.
+        far = (ratio > _FAR) & (ratio * scale > 0.3 * modelled)
         departing |= far & (np.abs(values) > _OWN * scale)
         ratios = np.maximum(ratios, np.where(far, ratio, 0.0))
     width = float(np.median(np.diff(time)))
@@ -299,8 +294,8 @@ def departures(diagnosis: Diagnosis, log: int, unexplained: Mapping[str, float])
 
 def _scale(values: FloatArray) -> float:
     """Robust standard deviation about zero of the values that are not zero, as in gaps."""
-    moving = np.abs(values[values != 0.0])
-    return _NORMAL * float(np.median(moving)) if len(moving) >= _FEWEST else 0.0
+    moving = values[values != 0.0]
+    return robust_std(moving) if len(moving) >= _FEWEST else 0.0
 
 
 def _ratio(values: FloatArray) -> FloatArray | None:

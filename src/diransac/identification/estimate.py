@@ -29,8 +29,6 @@ __all__ = [
     "Prediction",
 ]
 
-_PREDICTS = 0.5
-"""Error of a prediction, over that of no change, below which an estimate predicts."""
 
 TIME_LIMIT = "time limit reached"
 """Stop reason of a search that a limit on its time ended."""
@@ -88,7 +86,7 @@ class Competition:
     @property
     def predicts(self) -> bool:
         """True if the winner predicts much better than that nothing changes, at one horizon at least."""
-        return min(next(x for x in self.competitors if x.name == self.winner).errors) < _PREDICTS
+        return min(next(x for x in self.competitors if x.name == self.winner).errors) < 0.5
 
     def lines(self) -> list[list[str]]:
         """Rows of a table: the best variant of each source, its errors at each horizon, and whether it is as good."""

@@ -88,14 +88,6 @@ class Finding(str):
 Verdict = Literal["usable", "usable with care", "do not rely on this"]
 
 
-_MOST_SHOWN = 5
-"""Findings that are shown of one result."""
-
-
-_MARKS = {"bad": "!", "care": "·", "good": " "}
-"""Marks of the findings that are printed."""
-
-
 VALIDATE = "predict a log that it was not identified from: diransac validate RESULT.json OTHER_LOG"
 """Action for a result that nothing opposes."""
 
@@ -121,14 +113,15 @@ def shown(findings: Iterable[Finding], *, good: bool = False) -> tuple[list[Find
     first = dict[str, Finding]()
     for one in found:
         first.setdefault(one.action or one, one)
-    kept = list(first.values())[:_MOST_SHOWN]
+    kept = list(first.values())[:5]
     return kept, len(found) - len(kept)
 
 
 def shown_lines(findings: Iterable[Finding], *, good: bool = False) -> list[str]:
     """The findings that a person is shown, a line each, and one on those that are left out.  Parameters as `shown`."""
     found, more = shown(findings, good=good)
-    return [f"{_MARKS[x.level]} {x}" for x in found] + ([f"  and {more} more in the JSON"] if more else [])
+    marks = {"bad": "!", "care": "·", "good": " "}
+    return [f"{marks[x.level]} {x}" for x in found] + ([f"  and {more} more in the JSON"] if more else [])
 
 
 def next_line(findings: Iterable[Finding], otherwise: str = VALIDATE) -> str:

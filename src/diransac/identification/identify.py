@@ -32,9 +32,6 @@ from diransac.time_limit import check_time, time_limited
 
 __all__ = ["METHODS", "Identification", "checked_hold", "identify", "method_object"]
 
-_DOUBTFUL = 0.25
-"""Part of an acceleration that is unexplained from which on mistakes of columns are sought."""
-
 
 def identify(
     model: Model,
@@ -401,7 +398,8 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     """The result with findings on mistakes of columns: contradictions, and what explains a bad answer."""
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
     is_bad, n_tested = result.verdict == "do not rely on this", 0
-    is_doubtful = is_bad or max(left, default=0.0) > _DOUBTFUL
+    # A quarter of an acceleration that is unexplained is a reason to test columns.
+    is_doubtful = is_bad or max(left, default=0.0) > 0.25
     if is_doubtful:
         mistakes, n_tested = _mistakes(dataset)
     else:

@@ -413,6 +413,11 @@ class Result:
         return self.estimate.diagnosis
 
     @property
+    def separates_forces(self) -> bool:
+        """True if the method separates unmodelled forces from noise; a simulation of a whole log adds them up."""
+        return self.diagnosis is not None
+
+    @property
     def suggestions(self) -> tuple[Suggestion, ...]:
         """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
         return self.estimate.suggestions

@@ -32,14 +32,10 @@ __all__ = ["as_dict", "export", "from_data", "write"]
 _FORMAT = 10
 _SINCE: Mapping[int, Mapping[str, object]] = {9: {"mistakes": (), "n_columns_tested": 0}}
 """Formats that are read besides, with the values of what they lack."""
-_LATEST = 1e9
-"""Bound of delays and lags, s, and of the drift of gains."""
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
 _ROUNDING = 1e-3
 """Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
-_N_EXPORTED = 1000
-"""Draws of the parameters in a YAML file."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +165,7 @@ def _check_resolution(resolution: Resolution, n_u: int) -> None:
         raise ValueError(f"hold {resolution.hold}")
     if any(len(x) not in (0, n_u) for x in of_inputs):
         raise ValueError(f"timing of other than {n_u} inputs")
-    if not all(abs(x) < _LATEST for x in chain((timing.delay, timing.lag), *of_inputs)):
+    if not all(abs(x) < 1e9 for x in chain((timing.delay, timing.lag), *of_inputs)):
         raise ValueError("timing: it is that of no machine")
 
 
@@ -223,7 +219,7 @@ def _portable(result: Result, name: str | None = None) -> PortableModel:
     from diransac.export import PortableModel
 
     try:
-        samples = result.sample(_N_EXPORTED)
+        samples = result.sample(1000)
     except ResultError:
         samples = {}
     resolution = result.estimate.resolution

@@ -76,7 +76,7 @@ def _prior_lines(result: Result) -> list[str]:
 
 
 def _summary(result: Result) -> str:
-    whole = "" if result.diagnosis is None else "in one simulation of the whole log: "
+    whole = "in one simulation of the whole log: " if result.separates_forces else ""
     parts = [f"{whole}fit error {result.fit_error:.4g}", f"inliers {100.0 * result.inlier_fraction:.1f} %"]
     if result.estimate.resolution.interpolation:
         parts.append(result.estimate.resolution.interpolation)

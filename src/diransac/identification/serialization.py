@@ -96,7 +96,6 @@ def _decode_pair(data: Any) -> tuple[float, float]:
 
 _NUMBER, _NUMBERS = _Form(_encode_number, _decode_number), _Form(_encode_numbers, _decode_numbers)
 _MASK = _Form(_encode_mask, _decode_mask)
-_PAIR = _Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair)
 
 Number = Annotated[float, _NUMBER]
 """A number that may be infinite or NaN."""
@@ -108,7 +107,9 @@ Mask = Annotated[BoolArray, _MASK]
 """An array ``(N,)`` of Booleans, packed."""
 Values = Annotated[Mapping[str, float], _NUMBER.by_name()]
 """Numbers by name."""
-NumberPairs = Annotated[Mapping[str, tuple[float, float]], _PAIR.by_name()]
+NumberPairs = Annotated[
+    Mapping[str, tuple[float, float]], _Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair).by_name()
+]
 """Pairs of numbers by name."""
 Series = Annotated[Mapping[str, FloatArray], _NUMBERS.by_name()]
 """Arrays by name."""

@@ -29,12 +29,8 @@ StartRule = Literal["smoothed", "measured"]
 _MEMORY, _N_STEPS = 0.05, 20
 _CHANGE, _N_PROBES = 0.01, 4
 """Relative change of the parameters whose effect on a prediction is its sensitivity; number of its random signs."""
-_NOISE_WINDOWS = 40
-"""Short simulations from which the noise of a log is taken."""
 _FITTED = 2.0
 """Numbers that a short simulation fits to the samples of a signal."""
-_MOVES = 10.0
-"""Error of trivial predictions, in standard deviations of the noise, from which on a signal moves."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +184,8 @@ class OpenLoop:
         """
         assert self.smoothed is not None
         stretch = max(self.stretches, key=lambda x: x.stop - x.start)
-        every = max(1, (stretch.stop - stretch.start) // _NOISE_WINDOWS)
+        # Forty short simulations are enough.
+        every = max(1, (stretch.stop - stretch.start) // 40)
         rows = np.arange(stretch.start, stretch.stop, every)
         samples = self.smoothed.samples
         freedom = np.where(samples > 2 * _FITTED, 1.0 - _FITTED / np.maximum(samples, 2 * _FITTED), np.nan)
@@ -351,7 +348,8 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
         ratio, robust_ratio = total.squared / spread, total.robust_squared / regular
         held, uniform, noise = total.held / count, total.uniform / count, total.of_noise / count
         trivial = np.fmin(held, uniform)
-        moves = judged & (trivial > _MOVES**2 * noise) & (trivial > 0.0)
+        # A signal moves if trivial predictions err by ten standard deviations of its noise.
+        moves = judged & (trivial > 10.0**2 * noise) & (trivial > 0.0)
         excess = trivial - noise
         known = (total.of_noise + total.of_starts) / count
         error = np.sqrt(np.maximum(total.robust_squared / count - known, 0.0) / excess)

@@ -33,8 +33,6 @@ _SIZES = np.array([0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0])
 _N_LAGS, _SETTLED = 20, 0.1
 """Lags of the autocorrelation; part of the rows in which the filter settles, which does not count."""
 _DIFFERENCE, _LEAST_NOISE, _FIRST = 1e-6, 1e-4, 0.1
-_WHITE = 0.2
-"""Autocorrelation up to which innovations are nearly white, however many they are."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,8 @@ class Innovations:
     def coloured(self) -> dict[str, float]:
         """Largest autocorrelation of the signals whose innovations are clearly not white."""
         largest = {n: float(x[np.argmax(np.abs(x))]) for n, x in self.autocorrelation.items()}
-        return {n: x for n, x in largest.items() if abs(x) > _WHITE and self.whiteness[n] < 1e-3}
+        # Up to 0.2 innovations are nearly white, however many they are.
+        return {n: x for n, x in largest.items() if abs(x) > 0.2 and self.whiteness[n] < 1e-3}
 
     def spectrum(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Frequencies, Hz, and power density of a signal's normalised innovations, 1/Hz, by Welch's method.

@@ -34,7 +34,6 @@ __all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
 
 
 _WELL, _WEAKLY = 0.1, 0.5
-_FROZEN_SAMPLES = 10
 
 
 @dataclass(frozen=True)
@@ -233,7 +232,7 @@ def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
     low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
     apart = rows_per_sample(np.isfinite(values))
     run = _longest_run(values if apart == 1 else finite)
-    frozen = run * apart * log.dt if run >= _FROZEN_SAMPLES else 0.0
+    frozen = run * apart * log.dt if run >= 10 else 0.0
     with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
         n_spikes = int(preprocessing.hampel(continuous if apart == 1 else continuous[np.isfinite(values)])[0].sum())
     n_missing, rate = int(np.isnan(values).sum()), 1.0 / (apart * log.dt)

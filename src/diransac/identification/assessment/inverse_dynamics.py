@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PredictedForces", "force_errors", "predicted_forces"]
 
-_NO_FORCE = 1e-9
-"""Force over the inertial force of an equation, below which inputs exert none."""
-
 
 @dataclass(frozen=True)
 class PredictedForces:
@@ -83,7 +80,8 @@ def force_errors(
         return {}
     of_force, of_error = np.sum(squares, axis=0)
     names = dataset.model.rate_names
-    acting = of_force > _NO_FORCE**2 * of_force.max(initial=0.0)
+    # Inputs exert no force in an equation where theirs is this small beside the largest.
+    acting = of_force > 1e-9**2 * of_force.max(initial=0.0)
     return {n: float(100.0 * np.sqrt(e / f)) for n, f, e, x in zip(names, of_force, of_error, acting, strict=True) if x}
 
 

@@ -20,6 +20,7 @@ from diransac.identification.evaluation.prediction import Restarts, restart_rows
 from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.identify import checked_hold
 from diransac.identification.result import Result
+from diransac.identification.settings import finite_number
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 
@@ -115,7 +116,7 @@ def _with_start(log: Log, model: Model, given: Mapping[str, float]) -> Log:
     unknown = [name for name in given if name not in model.state]
     if unknown:
         raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(model.state)}')
-    known = {name: _finite(f"initial_state: {name}", value) for name, value in given.items()}
+    known = {name: finite_number(f"initial_state: {name}", value) for name, value in given.items()}
     start = {name: known[name] if name in known else _first(log, name) for name in model.state}
     absent = [name for name, value in start.items() if not np.isfinite(value)]
     if absent:
@@ -124,13 +125,6 @@ def _with_start(log: Log, model: Model, given: Mapping[str, float]) -> Log:
     constant = {name: np.full(len(log), value) for name, value in start.items()}
     units = {name: unit for name, unit in log.units.items() if name in inputs}
     return replace(log, signals={**inputs, **constant}, units=units, notes=())
-
-
-def _finite(what: str, value: object) -> float:
-    """A finite number.  Raises SettingsError: it is something else."""
-    if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
-        raise SettingsError(f"{what} is {value!r:.60}; give a finite number")
-    return float(value)
 
 
 def _first(log: Log, name: str) -> float:
@@ -146,7 +140,7 @@ def _starts(plant: ModelWithParameters, log: Log, simulation: _Bound, horizon: f
         rows = np.array([part.start for part in observations.stretches])
         return _measured_starts(observations, rows, len(observations))
     dt = observations.log.dt
-    if not _finite("horizon", horizon) > 0.5 * dt:
+    if not finite_number("horizon", horizon) > 0.5 * dt:
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds, at least one sample, {dt:g} s")
     n_rows = round(horizon / dt)
     diagnosis = _diagnosis_of(plant, log)

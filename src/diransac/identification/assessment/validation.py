@@ -21,7 +21,6 @@ from diransac.text_table import aligned, listed, number, percent
 
 __all__ = ["Validation", "validate"]
 
-_NICE = (1.0, 2.0, 5.0)
 _PARTS, _FEWEST_STEPS = (200.0, 50.0, 10.0), 5
 """Horizons are these parts of a log; samples of one at least."""
 _GOOD, _FAR = 0.1, 0.25
@@ -30,9 +29,6 @@ _TELLING = 0.1
 """Sensitivity of predictions to 1 % of the parameters and to the start, up to which a horizon tells models apart."""
 _BEYOND, _SEEN = 3.0, 0.2
 """Least error of a bad prediction, over its sensitivity; effect of uncertain starts up to which an error is seen."""
-_VISIBLE = 0.01
-_USE = "use the model: diransac export RESULT.json -o dynamics.c"
-_CORRECT = "identify from this log, too, with --with-suggestions for terms that the model lacks"
 
 
 @dataclass(frozen=True)
@@ -131,7 +127,7 @@ class Validation:
             *([*_head(scores), *aligned(self._rows(scores))] for scores in self.horizons),
             aligned(forces) if self.force_error_percent else [],
             *(_innovation_lines(one) for one in self.innovations),
-            [next_line(self.findings, _USE)],
+            [next_line(self.findings, "use the model: diransac export RESULT.json -o dynamics.c")],
         ]
         return "\n\n".join("\n".join(lines) for lines in parts if lines)
 
@@ -185,7 +181,8 @@ def _worst_state(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
     level: Level = "good" if x <= _GOOD else "care" if x <= _FAR else "bad"
     text = f"Over {over} the prediction of {name} is off by {percent(x)} of its motion, in excess of the noise"
     others = "; the other states are closer" if len(errors) > 1 else ""
-    yield Finding(level, f"{text}{others}.") if level == "good" else Finding(level, f"{text}{others}", _CORRECT)
+    correct = "identify from this log, too, with --with-suggestions for terms that the model lacks"
+    yield Finding(level, f"{text}{others}.") if level == "good" else Finding(level, f"{text}{others}", correct)
 
 
 def _worst_sensor(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
@@ -203,7 +200,7 @@ def _remarks(found: Validation) -> Iterator[Finding]:
     if longer and most > _TELLING:
         names = listed([one.name for one in longer])
         yield Finding("note", f"Prediction over {names} is not judged: {_cause(most)}.")
-    left_out = {n: x for n, x in found.outlier_fraction.items() if x > _VISIBLE}
+    left_out = {n: x for n, x in found.outlier_fraction.items() if x > 0.01}
     if left_out:
         name = max(left_out, key=lambda n: left_out[n])
         yield Finding(
@@ -352,7 +349,7 @@ def _outlier_fraction(dataset: Dataset, predictions: list[OpenLoop]) -> dict[str
 def _nice(seconds: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above ``seconds``."""
     decade = 10.0 ** np.floor(np.log10(seconds))
-    return float(max(x * decade for x in _NICE if x * decade <= seconds * (1.0 + 1e-9)))
+    return float(max(x * decade for x in (1.0, 2.0, 5.0) if x * decade <= seconds * (1.0 + 1e-9)))
 
 
 def _finite(x: object) -> object:

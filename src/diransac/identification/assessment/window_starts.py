@@ -25,6 +25,7 @@ from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
+from diransac.identification.regression.uncertainty import robust_std
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -32,20 +33,13 @@ if TYPE_CHECKING:
 
 __all__ = ["SmoothedLog", "WindowStarts", "smoothed_log", "window_starts"]
 
-_DENSE, _NORMAL = 20.0, 1.4826
-"""Samples from which on smoothing leaves their noise; standard deviation over the median of absolute deviations."""
-_OUTLIER = 6.0
-"""Distance of an outlier from the smoothed motion, in standard deviations of the noise."""
-_SMALLEST_NOISE = 1e-3
-"""Noise below which a distance from the smoothed motion is an error of that, over the spread of the signal."""
+_DENSE = 20.0
+"""Samples from which on smoothing leaves their noise."""
 _STEPS, _CONVERGED, _SHORTEST_STEP = 20, 1e-12, 0.05
 """Gauss-Newton steps, relative decrease of the loss below which it has converged, and the shortest part of a step."""
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
 _SOFT = 3.0
-_DAMPING = 1e-12
-_TINY = 1e-300
-_DIVERGED = 1e100
 
 
 @dataclass(frozen=True)
@@ -95,8 +89,10 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     samples = known.mean(axis=0) * min(2 * intervals.length + 1, len(one))
     of_motion = lower_scale(np.where(known, distances, 0.0), known)
     noise = np.where(samples < _DENSE, _of_pseudo_residuals(one.measured), np.nan_to_num(of_motion))
-    least = _SMALLEST_NOISE * motion.spread[columns]
-    outliers = known & (np.abs(np.where(known, distances, 0.0)) > _OUTLIER * np.maximum(noise, least))
+    # Smaller distances are errors of the smoothed motion.
+    least = 1e-3 * motion.spread[columns]
+    # Outliers are six standard deviations of the noise from the motion.
+    outliers = known & (np.abs(np.where(known, distances, 0.0)) > 6.0 * np.maximum(noise, least))
     return SmoothedLog(signals, noise, outliers, intervals.length, samples)
 
 
@@ -112,7 +108,7 @@ def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:
         known = y[rows]
         residuals = known[1:-1] - (1.0 - later) * known[:-2] - later * known[2:]
         scaled = residuals / np.sqrt(1.0 + np.square(later) + np.square(1.0 - later))
-        found.append(_NORMAL * float(np.median(np.abs(scaled))))
+        found.append(robust_std(scaled))
     return np.array(found)
 
 
@@ -216,8 +212,8 @@ class _Fit:
             g = np.einsum(
                 "krsi,krs,krs->ki", jacobian, weights, np.where(self._known & np.isfinite(errors), errors, 0.0)
             )
-            d = np.sqrt(np.einsum("kii->ki", G)) + _TINY**0.5
-            scaled = G / d[:, :, None] / d[:, None, :] + _DAMPING * np.eye(G.shape[1])
+            d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300**0.5
+            scaled = G / d[:, :, None] / d[:, None, :] + 1e-12 * np.eye(G.shape[1])
             if step == _STEPS:
                 break
             moved = states - part[:, None] * np.linalg.solve(scaled, (g / d)[:, :, None])[:, :, 0] / d
@@ -237,7 +233,7 @@ class _Fit:
         K, m, n_x = states.shape
         rows = np.repeat(self._first, m)
         found = self._simulation.errors(0, self._parameters, states.reshape(-1, n_x), rows, self._n_rows)
-        return np.where(np.abs(found) < _DIVERGED, found, np.inf).reshape(K, m, self._n_rows, -1)
+        return np.where(np.abs(found) < 1e100, found, np.inf).reshape(K, m, self._n_rows, -1)
 
     def trajectories(self, states: FloatArray) -> FloatArray:
         """States ``(K, m, n_rows, n_x)`` of m simulations of each window."""

@@ -21,17 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["disagreements"]
 
-_LEVEL = 1e-3
-"""Probability, over all logs together, of naming a log that agrees."""
-
-_NEGLIGIBLE = 1e-3
-"""Relative difference that is none, however narrow the intervals are."""
 
 _DELAY, _SMALL_DELAY = "input delay [s]", 0.25
 """Name of the delay of the inputs in a sentence, and the difference that is none, samples."""
-
-_ROUNDING = 1e-12
-"""Relative standard deviation that any estimate has."""
 
 
 def disagreements(
@@ -69,7 +61,8 @@ def disagreements(
         else:
             reason = own if isinstance(own, str) else "alone it tells too little of the parameters"
             notes.append(f"{dataset.given[i].source} could not be compared with the other logs: {reason}")
-    level = _LEVEL / max(1, 2 * len(shared) * n)
+    # The probability, over all logs together, of naming a log that agrees is 0.1 %.
+    level = 1e-3 / max(1, 2 * len(shared) * n)
     while len(found) > 1:
         tests = {i: _worst(found, i, shared, level, dataset.segments[i].log.dt) for i in found}
         worst = max(found, key=lambda i: tests[i][0])
@@ -114,9 +107,10 @@ def _worst(
         if not np.isfinite(variance) or not others:
             continue
         mean, spread, ratio = _combined(others)
+        # A difference of 0.1 % is none, however narrow the intervals are.
         allowed = max(
             t * np.sqrt(ratio * (variance + spread)),
-            _NEGLIGIBLE * abs(mean),
+            1e-3 * abs(mean),
             _SMALL_DELAY * dt if name == _DELAY else 0.0,
         )
         surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
@@ -138,7 +132,8 @@ def _marginal(found: LogEstimate, name: str) -> tuple[float, float]:
 def _combined(values: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
     """Precision-weighted mean of (value, variance) pairs, its variance, and the Birge ratio, at least 1."""
     p, v = np.array(values).T
-    v = np.maximum(v, np.square(_ROUNDING * np.abs(p).max()) + np.finfo(float).tiny)
+    # Any estimate has an error by rounding.
+    v = np.maximum(v, np.square(1e-12 * np.abs(p).max()) + np.finfo(float).tiny)
     least = v.min()
     weights = least / v
     mean = float(weights @ p / weights.sum())

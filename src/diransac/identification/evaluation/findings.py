@@ -25,17 +25,12 @@ __all__ = ["bounds_text", "findings_of"]
 _NEAR, _FAR = 0.05, 0.25
 """Median errors of simulations, over the range of the signal, that are good, and that need care."""
 _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
-_BREAKDOWN = 2.0 / 3.0
-"""Fraction of outliers beyond which the estimate of lo-diransac is arbitrary."""
-_UNCERTAIN = 0.5
 _WIDENED, _AMBIGUOUS = 2.0, 0.1
 """Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _CONTRADICTION = 3.0
 """Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
-_IMPOSSIBLE = 4.0
-"""Distance of base parameters from those of possible bodies, in standard errors of one, which needs care."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
@@ -113,7 +108,8 @@ def _bodies(result: Result) -> Iterator[Finding]:
     values = np.array([result.parameters[n] for n in parameters])
     changes = impossible_changes(parameters, values, result.covariance)
     name = max(changes, key=lambda n: abs(changes[n]), default="")
-    if name and abs(changes[name]) > _IMPOSSIBLE:
+    # Of many base parameters, the largest of differences by chance is up to four standard errors.
+    if name and abs(changes[name]) > 4.0:
         far = number(abs(changes[name]), 2)
         yield Finding(
             "care",
@@ -189,7 +185,7 @@ def _simulation(result: Result) -> Iterator[Finding]:
     Where the method restarts simulations, one of a whole log needs care at worst, because unmodelled forces accumulate
     in it.
     """
-    logs, restarts = result.logs, result.diagnosis is not None
+    logs, restarts = result.logs, result.separates_forces
     for one, found in _predicted(logs):
         if np.isfinite(found.divergence):
             where = f" in {one.source}" if len(logs) > 1 else ""
@@ -223,7 +219,7 @@ def _median_error(result: Result, found: Prediction, where: str) -> Finding:
             return Finding(level, f"Median error of {method}: within the noise, in every signal.")
     else:
         method = "one simulation of the whole log"
-        level = "care" if result.diagnosis is not None and level == "bad" else level
+        level = "care" if result.separates_forces and level == "bad" else level
     others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
     claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
     return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
@@ -245,7 +241,7 @@ def _inliers(result: Result) -> Iterator[Finding]:
         return
     n_rows = sum(found.n_rows for _, found in predicted) or sum(one.n_rows for one in logs)
     text = f"{percent(fraction)} of {plural(n_rows, 'row')} agree with"
-    if result.diagnosis is not None:
+    if result.separates_forces:
         yield Finding(
             "note",
             f"{text} an open-loop simulation of the whole log, in which effects of unmodelled forces and errors of its "
@@ -281,7 +277,8 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
     most = found.outlier_fraction[name]
     if most > _FEW:
         text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
-        if most <= _BREAKDOWN:
+        # Beyond two thirds the estimate of lo-diransac is arbitrary.
+        if most <= 2.0 / 3.0:
             if most <= _HALF:
                 yield Finding("note", f"{text}; the estimate down-weights them.")
             else:
@@ -352,7 +349,7 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
     unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
     stuck = {name.partition("[")[0] for name in result.on_bounds}
     lost = [name for name in unknown if name not in stuck]
-    if lost and result.diagnosis is None:
+    if lost and not result.separates_forces:
         rows = plural(result.n_fitted, "fitted row")
         claim = f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it"
         yield Finding("care", claim, "give a longer log")
@@ -369,7 +366,7 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
         if names:
             claim = f"{', '.join(names)} {_differ(names)} significantly from zero: 0 is in the 95 % interval"
             yield Finding("note", f"{claim}.") if possible else Finding("care", claim, _more_of(result, names))
-    wide = sorted((n for n, x in widths.items() if x > _UNCERTAIN), key=lambda n: -widths[n])
+    wide = sorted((n for n, x in widths.items() if x > 0.5), key=lambda n: -widths[n])
     if wide:
         listed = ", ".join(f"{n} by ±{percent(widths[n])}" for n in wide)
         yield Finding("care", f"Uncertain by more than half (95 % interval): {listed}", _more_of(result, wide))
@@ -436,7 +433,9 @@ def _search(result: Result) -> Iterator[Finding]:
         yield Finding("care", "The time limit ended the search; parameters are the best so far", "give a longer limit")
         return
     wanted = result.settings.stop_inlier_fraction
-    if result.iterations and result.diagnosis is None and wanted is not None and result.inlier_fraction < wanted:
+    if wanted is None or result.separates_forces or not result.iterations:
+        return
+    if result.inlier_fraction < wanted:
         samples = plural(result.iterations, "sample")
         yield Finding("note", f"The search ended after {samples}, short of the {percent(wanted)} inliers to stop at.")
 

@@ -36,13 +36,8 @@ __all__ = [
     "unexplained",
 ]
 
-_MET = 0.5
-_MOST_NOISE = 0.5
 _MEDIAN = 0.6745  # of the absolute value of Gaussian noise, in standard deviations
-_N_RESTARTS = 12
 _N_WINDOWS, _ROWS_PER_WINDOW = 40, 25
-_MOVING = 0.01
-"""Acceleration of a coordinate, over the largest one of its unit, below which the coordinate is at rest."""
 
 
 # ---------------------------------------------------------------------- simulations
@@ -96,7 +91,7 @@ def restarts_of(diagnosis: Diagnosis, observations: Segment) -> Restarts | None:
     time, names = diagnosis.smoothed_time, observations.model.state
     if not set(names) <= set(diagnosis.smoothed_states):
         return None
-    every = max(1, round(len(time) / _N_RESTARTS))
+    every = max(1, round(len(time) / 12))
     dt, start = observations.log.dt, observations.log.time[observations.offset]
     n_rows = max(1, every * round(float(time[1] - time[0]) / dt)) if len(time) > 1 else len(observations)
     rows = restart_rows(observations, n_rows, np.round((time - start) / dt).astype(int))
@@ -217,7 +212,8 @@ class SimulatedLog:
         found = {}
         columns = zip(self.observations.measured.T, self.errors.T, self.observations.ranges, strict=True)
         for name, (measured, error, (low, high)) in zip(self.observations.signals, columns, strict=True):
-            met = measured[np.abs(error) <= _MET * (high - low)]
+            # Samples close to the simulation belong to the range, too.
+            met = measured[np.abs(error) <= 0.5 * (high - low)]
             found[name] = float(met.min(initial=low)), float(met.max(initial=high))
         return found
 
@@ -235,7 +231,7 @@ class SimulatedLog:
         Then nothing is subtracted, and no sample is taken for an outlier.
         """
         noise = self.noise.get(name, 0.0)
-        if noise <= _MOST_NOISE * width:
+        if noise <= 0.5 * width:
             return max(0.0, self.median_errors[name] - _MEDIAN * noise)
         return float(np.median(self._absolute_errors(name, np.ones_like(self.inliers))))
 
@@ -297,7 +293,8 @@ def unexplained(diagnosis: Diagnosis, simulated: SimulatedLog) -> dict[str, floa
     left = {n: _rms(x) for n, x in diagnosis.unmodelled_accelerations.items()}
     total = {n: x + _rms(simulated.accelerations[n]) for n, x in left.items()}
     largest = {unit: max(x for n, x in total.items() if units[n] == unit) for unit in {units[n] for n in total}}
-    return {n: left[n] / x for n, x in total.items() if x > _MOVING * largest[units[n]]}
+    # A coordinate is at rest beside one that accelerates a hundred times as much.
+    return {n: left[n] / x for n, x in total.items() if x > 0.01 * largest[units[n]]}
 
 
 def _rms(values: FloatArray) -> float:

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Scoring", "as_estimated", "choose_scoring", "evaluate", "judged_signals", "mean_squared_error", "rms_error"]
 
-_THRESHOLD_IN_SPREADS = 0.2
-_ACCELERATION_WEIGHT = 0.1
-
 
 # ---------------------------------------------------------------------- weights and thresholds
 
@@ -126,9 +123,9 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
         slow = _with_accelerations(dataset.model)
         if weights is None:
-            weights = {n: (_ACCELERATION_WEIGHT if n in slow else 1.0) / x for n, x in moving.items()}
+            weights = {n: (0.1 if n in slow else 1.0) / x for n, x in moving.items()}
         if thresholds is None:
-            thresholds = {n: _THRESHOLD_IN_SPREADS * x for n, x in moving.items()}
+            thresholds = {n: 0.2 * x for n, x in moving.items()}
     w, eps = dataset.by_signal(weights), dataset.by_signal(thresholds)
     if not (w > 0.0).any():
         raise SettingsError("every error weight is zero; give one signal a positive weight")

@@ -45,7 +45,6 @@ __all__ = [
     "search",
 ]
 
-_FIRST_BATCH = 16
 _OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 
@@ -368,7 +367,7 @@ def search(variant: RansacMethod, samples: Samples, callback: Callback | None = 
 def _batches(settings: Settings) -> Iterator[range]:
     """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
     may_stop = settings.stop_inlier_fraction is not None
-    start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
+    start, size = 0, min(16, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
         stop = min(start + size, settings.max_iterations)
         yield range(start, stop)

@@ -27,8 +27,6 @@ __all__ = ["Evaluator", "FittedSamples", "Hypothesis", "Samples", "Score", "Scor
 
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
 
-_MOST_KEPT = 2**24  # bytes
-
 
 @dataclass(frozen=True)
 class Score:
@@ -196,7 +194,7 @@ class Samples:
         self.estimator, self._evaluator = estimator, evaluator
         self._sampler, self._sample_size, self._seed = sampler, sample_size, seed
         self._kept: dict[range | bytes, FittedSamples] = {}
-        self._room = _MOST_KEPT
+        self._room = 2**24  # bytes
 
     def batch(self, iterations: range) -> FittedSamples:
         """Samples of consecutive iterations."""

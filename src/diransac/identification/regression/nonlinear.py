@@ -43,20 +43,9 @@ if TYPE_CHECKING:
 __all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
-_START_DECADES = 3.0
 _ROWS_FOR_STARTS = 100
-_ROWS_FOR_WHOLE = 2000
-_SOME_STARTS = 20
-"""Other parameters at which the rank of the Jacobian is compared."""
-# Evaluated together: bounds the memory, whatever the number of sets.
-_ROWS_AT_A_TIME = 300_000
-_CONVERGED = 1e-14
-# Errors whose squares overflow in a sum: a lane with one has diverged.
-_HUGE = 1e140
 # Marquardt's damping at the start, and its bounds.
 _DAMPING = (1e-3, 1e-12, 1e12)
-# Standard deviation of the errors at least, over the RMS of the accelerations, where priors are weighed against them.
-_LEAST_NOISE = 1e-5
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
 _LOG_BOUND = 27.6
 
@@ -148,7 +137,7 @@ class BoundNonlinear:
             self._starts[:, determined] = self._chart.clip(self._chart.to_free(values[None]))[:, determined]
         self._inflation = 1.0
         everything = np.arange(self.n_rows)[None]
-        whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // _ROWS_FOR_WHOLE)]))
+        whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // 2000)]))
         self._starts = np.vstack([whole, self._starts])
         self.of_all_rows = self._chart.to_parameters(whole)[0]
         errors, J = self._errors(everything, whole)
@@ -181,7 +170,7 @@ class BoundNonlinear:
     def is_informed_elsewhere(self) -> bool:
         """True if the Jacobian of the rows has full rank at other parameters than those of the fit."""
         rows = np.arange(self.n_rows)[:: max(1, self.n_rows // _ROWS_FOR_STARTS)]
-        some = self._starts[1 :: max(1, len(self._starts) // _SOME_STARTS)]
+        some = self._starts[1 :: max(1, len(self._starts) // 20)]
         J = self._errors(np.tile(rows, (len(some), 1)), some)[1].reshape(len(some), -1, self._n_p)
         J = J[np.isfinite(J).all(axis=(1, 2))]
         J = J / np.maximum(np.sqrt(np.square(J).mean(axis=1, keepdims=True)), np.finfo(float).tiny)
@@ -207,7 +196,8 @@ class BoundNonlinear:
         fits = np.empty((len(row_sets), self._n_p))
         for length in {len(rows) for rows in row_sets}:
             places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
-            at_a_time = max(1, _ROWS_AT_A_TIME // (len(self._starts) * max(1, length)))
+            # Bounds the memory, whatever the number of sets.
+            at_a_time = max(1, 300_000 // (len(self._starts) * max(1, length)))
             for first in range(0, len(places), at_a_time):
                 some = places[first : first + at_a_time]
                 fits[some] = self._fit_equal(np.array([row_sets[i] for i in some]))
@@ -272,7 +262,8 @@ class BoundNonlinear:
     def _prior_errors(self, variance: FloatArray, shift: FloatArray | None) -> _PriorErrors:
         """Errors of the priors where the errors of the rows have a variance ``(n_sets,)``."""
         layout = self._layout
-        sigma = np.sqrt(np.maximum(self._inflation * np.nan_to_num(variance), _LEAST_NOISE**2))
+        # The errors have a standard deviation of 1e-5 of the accelerations, at least.
+        sigma = np.sqrt(np.maximum(self._inflation * np.nan_to_num(variance), 1e-5**2))
         mean = layout.prior_mean if shift is None else layout.prior_mean + shift
         return _PriorErrors(
             layout.with_prior, mean[layout.with_prior], sigma[:, None] / layout.prior_std[layout.with_prior]
@@ -297,7 +288,7 @@ class BoundNonlinear:
             with np.errstate(invalid="ignore"):
                 gain = costs[active] - trial_costs
             better = gain > 0.0
-            going = np.where(better, gain > _CONVERGED * costs[active], damping[active] < _DAMPING[2])
+            going = np.where(better, gain > 1e-14 * costs[active], damping[active] < _DAMPING[2])
             damping[active] = np.clip(damping[active] * np.where(better, 0.1, 4.0), *_DAMPING[1:])
             to = active[better]
             free[to], errors[to], J[to], costs[to] = (x[better] for x in (trial, trial_errors, trial_J, trial_costs))
@@ -326,7 +317,8 @@ class BoundNonlinear:
         if self._missing.any():
             missing = self._missing[flat].reshape(n_lanes, -1)
             errors[missing], J[missing] = 0.0, 0.0
-        bad = ~(np.all(np.abs(errors) < _HUGE, axis=1) & np.all(np.abs(J) < _HUGE, axis=(1, 2)))
+        # Squares of such errors overflow in a sum: the lane has diverged.
+        bad = ~(np.all(np.abs(errors) < 1e140, axis=1) & np.all(np.abs(J) < 1e140, axis=(1, 2)))
         errors[bad], J[bad] = np.inf, 0.0
         if prior is None:
             return errors, J
@@ -447,7 +439,7 @@ class ParameterChart:
         """Points ``(n, n_p)``: over the bounds where both are given, else over six decades about 1 on the open side."""
         rng = np.random.default_rng(20231003)
         shape = (n, len(self._log))
-        spread = _START_DECADES * np.log(10.0)
+        spread = 3.0 * np.log(10.0)
         sizes, signs = np.exp(rng.uniform(-spread, spread, shape)), rng.choice([-1.0, 1.0], shape)
         lower, upper = np.isfinite(self._lower), np.isfinite(self._upper)
         points = np.where(lower, self._lower + sizes, np.where(upper, self._upper - sizes, signs * sizes))

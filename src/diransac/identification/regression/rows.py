@@ -43,12 +43,6 @@ __all__ = [
 _STEPS, _FAR = 10, 3.0
 # Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
 _ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY, _ROUNDING = 5000, 1000, 1e150, 1e-300, 1e-9
-# Residual of an equation, over its terms, that is exact.
-_EXACT = 1e-6
-# Eigenvalue of a log's rows, over their number, below which it is zero.
-_RANK_OF_LOG = 1e-9
-# Part of a parameter's column that those of the others leave where the equations inform about it.
-_INFORMED = 0.1
 # Standard errors of an estimate outside of its bounds that are no chance; batches of rows for them.
 _CLEARLY, _BATCHES = 3.0, 30
 
@@ -154,11 +148,12 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     size = np.sqrt(np.square(weighted).mean(axis=0))
     size = np.where(size > 0.0, size, 1.0)
     units = scale[-1] / scale[:-1]
+    # A residual of a millionth of the terms is exact.
     return Solution(
         p * units,
         _errors(weighted, weights * (A @ p - y)) * units,
-        np.maximum(np.divide(*sizes), _EXACT),
-        null_space((weighted / size).T @ (weighted / size), size * scale[:-1], _RANK_OF_LOG * len(A)),
+        np.maximum(np.divide(*sizes), 1e-6),
+        null_space((weighted / size).T @ (weighted / size), size * scale[:-1], 1e-9 * len(A)),
         has_known_terms,
     )
 
@@ -249,7 +244,8 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
     norms = np.linalg.norm(A, axis=0)
     A = A / np.where(norms > 0.0, norms, 1.0)
     free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in _each(A)]
-    return np.asarray((norms > 0.0) & (np.array(free) > _INFORMED))
+    # Equations inform about a parameter if the other columns leave a tenth of its own.
+    return np.asarray((norms > 0.0) & (np.array(free) > 0.1))
 
 
 def _each(A: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -21,6 +21,7 @@ __all__ = [
     "N_BLOCKS",
     "combined",
     "jackknife_covariance",
+    "robust_std",
     "rows_without",
     "score_inflation",
     "student_quantile",
@@ -33,8 +34,6 @@ __all__ = [
 N_BLOCKS = 10
 # Standard deviations of a normal distribution beyond which nothing lies, to rounding errors; points of a quadrature.
 _FAR, _N_POINTS = 9.0, 100
-# Ridge that makes the information of an undetermined parameter definite, over the number of rows.
-_RIDGE = 1e-10
 # Draws at a time, and the least fraction of them that is within the bounds.
 _N_DRAWS, _LEAST_INSIDE = 1000, 1e-3
 
@@ -80,6 +79,11 @@ def jackknife_covariance(
     return covariance
 
 
+def robust_std(deviations: FloatArray) -> float:
+    """Standard deviation of normal deviations from zero, by the median of their sizes: up to half may be outliers."""
+    return 1.4826 * float(np.median(np.abs(deviations)))
+
+
 def rows_without(rows: IntArray, group: IntArray) -> IntArray:
     """Rows ``(n,)``, ascending, without those of a group, which are among them."""
     left = np.ones(len(rows), bool)
@@ -112,7 +116,8 @@ def score_inflation(scores: FloatArray, information: FloatArray, variance: float
     """
     n_blocks, n = min(N_BLOCKS, len(scores)), scores.shape[1]
     sums = np.add.reduceat(scores, np.linspace(0, len(scores), n_blocks, endpoint=False).astype(int))
-    definite = information + _RIDGE * len(scores) * np.eye(n)
+    # A ridge makes the information of an undetermined parameter definite.
+    definite = information + 1e-10 * len(scores) * np.eye(n)
     observed = (sums * np.linalg.solve(definite, sums.T).T).sum() * n_blocks / max(1, n_blocks - 1)
     ratio = observed / (n * variance) if variance > 0.0 else 1.0
     return max(1.0, float(ratio)) if np.isfinite(ratio) else 1.0

@@ -23,7 +23,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import ModelError
-from diransac.identification.structure.lacking_terms import INPUT_GAIN
+from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS
 from diransac.model import Model
 from diransac.model.derivation import Symbols, call_user
 
@@ -34,14 +34,10 @@ TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 
 # Speed over which sign(v) is smooth, and speeds of the Stribeck effect, over the RMS speed.
 _SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
-_HARMONICS = (1, 2, 3)
-_POWERS = ((2, "quadratic"), (3, "cubic"))
 # Widths of a dead band, and levels of saturation, over the RMS input.
 _DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8), (0.6, 0.8, 1.0, 1.3, 1.7)
 # Largest change of an input's gain; how far a coefficient may leave what an actuator can do, as a part of it.
 _LARGEST_GAIN, _BEYOND = 0.5, 0.5
-_FORCES = {"m": "N", "rad": "N m"}
-_BLOCK = 4096
 
 
 @dataclass(frozen=True)
@@ -153,7 +149,7 @@ class CandidateTerms:
         entries, rows, columns = self._entries
         n = len(weights) // length
         found = np.zeros((n, self.terms[0].residuals.numel(), len(self)))
-        step = max(1, _BLOCK // length)
+        step = max(1, 4096 // length)
         for k in range(0, n, step):
             part = slice(k * length, (k + step) * length)
             values = _in_every_row(entries, [x[part] for x in motion]) * weights[part, None]
@@ -263,12 +259,12 @@ class _Maker:
             q = self.symbols[0][k]
             if derived and k == i:
                 yield self._term("stiffness", i, "stiffness", name, f"q.{name}", q, unit)
-                for n, kind in _POWERS if unit != "rad" else ():
+                for n, kind in ((2, "quadratic"), (3, "cubic")) if unit != "rad" else ():
                     code = f"q.{name} ** {n}"
                     yield self._term(
                         f"{kind} stiffness", i, f"{kind}_stiffness", f"{name}^{n}", code, q**n, f"({unit})^{n}"
                     )
-            for n in _HARMONICS if unit == "rad" else ():
+            for n in (1, 2, 3) if unit == "rad" else ():
                 many = f"{n} " if n > 1 else ""
                 kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"
                 for function in ("sin", "cos"):
@@ -320,7 +316,7 @@ class _Maker:
                 parameter = self._free(f"{label}_{name}")
                 line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
                 h = ca.densify(slope * value)
-                called = _NAMES[kind].format(x=name)
+                called = KINDS[kind][0].format(x=name)
                 yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h, bounds, called)
 
     def _changes(
@@ -362,7 +358,7 @@ class _Maker:
         factor = f" * {code}" if code else ""
         line = f"{'-' if sign < 0 else '+'} p.{parameter}{factor}"
         known = self.model.kinematics is None and self.model.force_sign
-        force = _FORCES.get(self.model.coordinates.get(place, ""), "") if known else ""
+        force = {"m": "N", "rad": "N m"}.get(self.model.coordinates.get(place, ""), "") if known else ""
         whole = "" if unit is None or not force else _over(force, unit)
         name = _name(kind, place, formula, self.model.coordinates.get(place, ""))
         return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals, name=name)
@@ -375,34 +371,11 @@ class _Maker:
         return next(x for x in names if x not in taken)
 
 
-_NAMES = {
-    "Coulomb friction": "dry friction of {x}",
-    "viscous friction": "viscous friction of {x}",
-    "quadratic drag": "quadratic drag of {x}",
-    "asymmetric drag": "drag of {x} in a current",
-    "Stribeck friction": "Stribeck friction of {x}",
-    "constant force": "constant {force} {x}",
-    "constant term": "constant rate of {x}",
-    "linear term": "decay of {x}",
-    "quadratic term": "quadratic decay of {x}",
-    "stiffness": "spring on {x}",
-    "quadratic stiffness": "quadratic spring on {x}",
-    "cubic stiffness": "cubic spring on {x}",
-    INPUT_GAIN: "gain of {x}",
-    "input offset": "offset of {x}",
-    "curved input": "curved gain of {x}",
-    "dead band": "dead band of {x}",
-    "saturation": "saturation of {x}",
-}
-"""Names by kind; {force} is a force along or a torque about a coordinate, or what acts on a velocity."""
-_ACTIONS = {"m": "force along", "rad": "torque about"}
-
-
 def _name(kind: str, place: str, formula: str, unit: str) -> str:
     """Name of a term in the equation of a coordinate with a unit, or of a velocity without one."""
-    force, first = _ACTIONS.get(unit, "force on"), kind.partition(" ")[0]
-    if kind in _NAMES:
-        return _NAMES[kind].format(x=place, force=force)
+    force, first = {"m": "force along", "rad": "torque about"}.get(unit, "force on"), kind.partition(" ")[0]
+    if kind in KINDS and KINDS[kind][0]:
+        return KINDS[kind][0].format(x=place, force=force)
     if first in ("gravity", "harmonic"):
         angle = kind.rpartition(" ")[2]
         if first == "harmonic":

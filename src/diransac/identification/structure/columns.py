@@ -44,7 +44,6 @@ _UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m
 _UNITS += ("A", "mA", "K", "s", "ms")
 _TINY = 1e-300
 _OFFSETS = {"K": ("degC", 1.0, 273.15)}
-_TIMES = ("ms", "us")
 # Samples over which changes are compared with integrals of derivatives; scatter of their ratios that is agreement, and
 # largest logarithm of a ratio over that of a unit; part of the samples that both columns need.
 _SPANS, _AGREES, _SAME_FACTOR, _KNOWN = (1, 4, 16, 64, 256), 0.25, 0.1, 0.05
@@ -55,8 +54,6 @@ _MUCH_BETTER, _AS_GOOD, _DISTINCT = 0.5, 1.05, 1.5
 _MEDIAN = 5
 # Rows of a log that are enough to find a mistake.
 _ENOUGH = 20_000
-# Signals of a unit of which all subsets are tested.
-_SUBSETS = 3
 
 
 @dataclass(frozen=True)
@@ -162,7 +159,7 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     ratios = list(_ratios(model, prepared))
     named = [(x, culprit) for x in ratios if (culprit := _culprit(model, x.low, x.high, x.ratio)) is not None]
     slow = next(
-        (u for u in _TIMES if ratios and all(_is_near(x.ratio, _factor(u, "s") ** x.order) for x in ratios)), ""
+        (u for u in ("ms", "us") if ratios and all(_is_near(x.ratio, _factor(u, "s") ** x.order) for x in ratios)), ""
     )
     if slow and len(ratios) > 1:
         why = f"all derivatives are those of a clock that is {number(1.0 / _factor(slow, 's'))} times as fast"
@@ -431,7 +428,8 @@ def _corrections(model: Model) -> Iterator[tuple[tuple[str, ...], str, float, fl
     for kind in (model.inputs, moving, model.first_order):
         for unit in dict.fromkeys(kind.values()):
             names = tuple(n for n, x in kind.items() if x == unit)
-            sizes = range(1, len(names) + 1) if len(names) <= _SUBSETS else (1, len(names))
+            # All subsets of few signals of a unit are tested.
+            sizes = range(1, len(names) + 1) if len(names) <= 3 else (1, len(names))
             groups = [group for size in sizes for group in combinations(names, size)]
             yield from ((g, other, factor, 0.0) for g in groups for other, factor in _other_units(unit))
             yield from ((g, "", -1.0, 0.0) for g in groups)

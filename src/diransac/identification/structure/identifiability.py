@@ -35,8 +35,6 @@ __all__ = [
 _COLLINEAR, _PART_OF_CORRELATION = 0.05, 0.2
 # Largest difference of equal projectors.
 _SAME = 1e-5
-# Standard errors of a 95 % interval to either side.
-_TWO_SIDED = 1.96
 
 
 @dataclass(frozen=True)
@@ -309,7 +307,8 @@ def vague_parameters(
     tuple of Ambiguity
     """
     errors = np.sqrt(np.diag(covariance))
-    uncertain = np.isfinite(errors) & (_TWO_SIDED * errors > np.abs(values))
+    # Zero is in the 95 % interval.
+    uncertain = np.isfinite(errors) & (1.96 * errors > np.abs(values))
     errors = np.where(uncertain, errors, 0.0)
     found = collinear(names, values, correlations * errors[:, None] * errors, uncertain)
     return tuple(x for x in found if x.n_determined)

@@ -23,6 +23,7 @@ import numpy as np
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import SettingsError
 from diransac.identification.regression.uncertainty import combined
+from diransac.identification.settings import finite_number
 from diransac.identification.structure.structural import structural, structural_slopes
 from diransac.model import expressions
 
@@ -201,14 +202,6 @@ def _check_name(model: Model, name: object, what: str) -> None:
         raise SettingsError(f'{what}: model "{model.name}" has no parameter "{name}"; it has {known}')
 
 
-def _finite(what: str, value: object) -> float:
-    """The number itself.  Raises SettingsError: it is none, or not finite."""
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not is_number or not np.isfinite(value):  # type: ignore[call-overload]  # a number
-        raise SettingsError(f"{what} is {value!r:.60}; give a finite number")
-    return float(value)  # type: ignore[arg-type]
-
-
 def _fixed_value(model: Model, name: str, value: object) -> float:
     _check_name(model, name, "fixed")
     bounds = model.parameters[name]
@@ -216,7 +209,7 @@ def _fixed_value(model: Model, name: str, value: object) -> float:
         if bounds.value is None:
             raise SettingsError(f"{name} has no nominal value; give one, as in fixed={{{name!r}: ...}}")
         return float(bounds.value)
-    found = _finite(f"the fixed value of {name}", value)
+    found = finite_number(f"the fixed value of {name}", value)
     if not bounds.admits(found):
         raise SettingsError(f"the fixed value {found:g} of {name} is outside its bounds")
     return found
@@ -226,8 +219,8 @@ def _prior(model: Model, name: str, pair: object) -> tuple[float, float]:
     _check_name(model, name, "priors")
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise SettingsError(f"the prior of {name} is {pair!r:.60}; give its mean and standard deviation")
-    mean = _finite(f"the prior mean of {name}", pair[0])
-    std = _finite(f"the prior standard deviation of {name}", pair[1])
+    mean = finite_number(f"the prior mean of {name}", pair[0])
+    std = finite_number(f"the prior standard deviation of {name}", pair[1])
     if not std > 0.0:
         raise SettingsError(f"the prior standard deviation of {name} is {std:g}; give a positive number, or fix {name}")
     if not model.parameters[name].admits(mean):

@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,12 +25,10 @@ from diransac.arrays import FloatArray
 from diransac.identification.serialization import Number, Values
 from diransac.model import Model, Parameter, expressions
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = [
     "INPUT_CHANGES",
     "INPUT_GAIN",
+    "KINDS",
     "PossibleTerm",
     "StructuralUncertainty",
     "Suggestion",
@@ -41,27 +39,33 @@ __all__ = [
 ]
 
 _BISECTIONS, _ROUNDING, _LARGEST = 60, 1e-9, 1e100
-_FAR = 9.0
-"""Standard deviations beyond which a normal distribution has nothing, to rounding errors."""
-_MOTIONS = {
-    "Coulomb friction": "reversals of {place} at low speed",
-    "Stribeck friction": "reversals of {place} at low speed",
-    "viscous friction": "speeds of {place} over a wider range",
-    "quadratic drag": "speeds of {place} over a wider range",
-    "asymmetric drag": "motion of {place} in both directions",
-    "linear term": "a wider range of {place}",
-    "quadratic term": "a wider range of {place}",
-    "constant term": "a wider range of {place}",
-    "constant force": "larger accelerations of {place}, of both signs",
-    "stiffness": "a wider range of {place}",
-    "product of velocities": "motion in which the velocities of {formula} vary independently",
-    "input gain": "a wider range of {place}",
-    "input offset": "a wider range of {place}, of both signs",
-    "curved input": "a wider range of {place}",
-    "dead band": "small and large values of {place}",
-    "saturation": "small and large values of {place}",
+INPUT_GAIN, _RICHER = "input gain", "richer motion of {place}"
+INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
+"""Kinds of the terms that change an input."""
+KINDS = {
+    "Coulomb friction": ("dry friction of {x}", "reversals of {place} at low speed"),
+    "Stribeck friction": ("Stribeck friction of {x}", "reversals of {place} at low speed"),
+    "viscous friction": ("viscous friction of {x}", "speeds of {place} over a wider range"),
+    "quadratic drag": ("quadratic drag of {x}", "speeds of {place} over a wider range"),
+    "asymmetric drag": ("drag of {x} in a current", "motion of {place} in both directions"),
+    "linear term": ("decay of {x}", "a wider range of {place}"),
+    "quadratic term": ("quadratic decay of {x}", "a wider range of {place}"),
+    "constant term": ("constant rate of {x}", "a wider range of {place}"),
+    "constant force": ("constant {force} {x}", "larger accelerations of {place}, of both signs"),
+    "stiffness": ("spring on {x}", "a wider range of {place}"),
+    "quadratic stiffness": ("quadratic spring on {x}", _RICHER),
+    "cubic stiffness": ("cubic spring on {x}", _RICHER),
+    "product of velocities": ("", "motion in which the velocities of {formula} vary independently"),
+    INPUT_GAIN: ("gain of {x}", "a wider range of {place}"),
+    "input offset": ("offset of {x}", "a wider range of {place}, of both signs"),
+    "curved input": ("curved gain of {x}", "a wider range of {place}"),
+    "dead band": ("dead band of {x}", "small and large values of {place}"),
+    "saturation": ("saturation of {x}", "small and large values of {place}"),
 }
-"""Motion, by kind, that separates a term from the parameters."""
+"""Name in an engineer's words, by kind, and the motion that separates a term from the parameters.
+
+{force} is a force along or a torque about a coordinate, or what acts on a velocity.
+"""
 _PREFIXES = {
     "harmonic ": "a wider range of {other}",
     "gravity ": "a wider range of {other}",
@@ -112,9 +116,9 @@ class PossibleTerm:
     def motion(self) -> str:
         """Motion that separates the term from the parameters."""
         other = self.kind.partition(" of " if " of " in self.kind else " to ")[2]
-        found = _MOTIONS.get(self.kind)
-        found = found or next((x for start, x in _PREFIXES.items() if self.kind.startswith(start)), None)
-        return (found or "richer motion of {place}").format(place=self.place, formula=self.formula, other=other)
+        of_prefix = next((x for start, x in _PREFIXES.items() if self.kind.startswith(start)), _RICHER)
+        _, motion = KINDS.get(self.kind, ("", of_prefix))
+        return motion.format(place=self.place, formula=self.formula, other=other)
 
 
 @dataclass(frozen=True)
@@ -200,7 +204,8 @@ def mixture_intervals(
 
 def _quantiles(weights: FloatArray, means: FloatArray, deviations: FloatArray, level: float) -> FloatArray:
     """Quantile ``(n,)`` of each mixture (K, n), by bisection."""
-    low, high = (means - _FAR * deviations).min(axis=0), (means + _FAR * deviations).max(axis=0)
+    # Beyond nine standard deviations a normal distribution has nothing, to rounding errors.
+    low, high = (means - 9.0 * deviations).min(axis=0), (means + 9.0 * deviations).max(axis=0)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         below = weights @ _normal((middle - means) / deviations) < level
@@ -234,13 +239,6 @@ def largest(terms: Sequence[PossibleTerm], shares: Mapping[str, float]) -> Possi
 
     found = max(terms, key=spread, default=None)
     return found if found is not None and spread(found) > 0.0 else None
-
-
-INPUT_GAIN = "input gain"
-
-
-INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
-"""Kinds of the terms that change an input."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
+from diransac.identification.regression.uncertainty import robust_std
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
@@ -33,7 +34,6 @@ _LAGS, _SIGNIFICANT, _CORRELATED = 5, 3.0, 0.1
 _FEWEST_ROWS, _CLIP, _ROUNDING = 30, 1.5, 1e-12
 # Ratio of small differences of neighbours to those of distant samples below which a signal moves, and samples for it.
 _NEARER, _ENOUGH_FOR_QUANTILES = 0.5, 150
-_TINY = 1e-300
 _ADVICE = "compare the terms, constants and bounds of the model with the machine"
 
 
@@ -69,13 +69,13 @@ def _moves(values: FloatArray) -> bool:
     values = values[known[0] :: rows_per_sample(np.isfinite(values))]
     values = values[:: _samples_held(values[np.isfinite(values)])]
     known = np.isfinite(values)
-    x = np.where(known, values - np.median(values[known]), 0.0) / (np.abs(values[known]).max() + _TINY)
+    x = np.where(known, values - np.median(values[known]), 0.0) / (np.abs(values[known]).max() + 1e-300)
     size = np.abs(x[known])
     if size.max() < _ROUNDING:
         return False
     if known.sum() < _FEWEST_ROWS:
         return True
-    x = np.clip(x / (1.4826 * float(np.median(size)) or float(size.mean())), -_CLIP, _CLIP)
+    x = np.clip(x / (robust_std(size) or float(size.mean())), -_CLIP, _CLIP)
     pairs = [(known[:-k] & known[k:], x[:-k] * x[k:]) for k in range(1, _LAGS + 1)]
     covariances = np.array([both @ product / max(1, both.sum()) for both, product in pairs])
     correlation = np.sqrt(np.mean(np.square(covariances))) / np.mean(np.square(x[known]))

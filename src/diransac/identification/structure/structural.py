@@ -52,12 +52,6 @@ Ranges = tuple[tuple[str, float, float], ...]
 """Smallest and largest value of states and inputs, by name."""
 
 
-_UNMEASURED = "since not all states are measured"
-
-
-_HOMOGENEOUS = "since each term has one of them as a factor (b = 0 in W p = b)"
-
-
 @lru_cache(maxsize=64)
 def structural(
     model: Model, measured: tuple[str, ...] | None = None, ranges: Ranges | None = None
@@ -112,9 +106,14 @@ def structural(
         parts = [x.of(group) for x in spaces]
         found.append(ambiguity_of(names[group].tolist(), parts, [p[free][group] for p in vectors]))
     if measured is not None:
-        found = [replace(x, reason=_UNMEASURED if x.n_determined else "") for x in found]
+        found = [replace(x, reason="since not all states are measured" if x.n_determined else "") for x in found]
     elif not model.nonlinear_parameters:
-        found = [replace(x, reason=_HOMOGENEOUS) if x.noun == "ratio" else x for x in found]
+        found = [
+            replace(x, reason="since each term has one of them as a factor (b = 0 in W p = b)")
+            if x.noun == "ratio"
+            else x
+            for x in found
+        ]
     every = joined(found)
     if any(not x.n_determined and _in_equations(model) & set(x.names) for x in every):
         where = "at random motions" if ranges is None else "at any motion in the ranges of the log"

@@ -43,7 +43,6 @@ __all__ = ["MeanForces", "SelectedTerm", "changes_beside", "select_terms", "span
 _EVIDENCE, _SHARE, _RELATIVE, _SIGNIFICANT = 3.0, 0.2, 1e-3, 4.0
 # Part of a column's square that own columns must leave; part of the force that inputs must leave unexplained.
 _INDEPENDENT, _IDENTITY = 1e-2, 1e-8
-_MOST = 5
 # Weights of neighbouring intervals in the regression for coefficients; smallest number of intervals of a block.
 _KERNEL, _LEAST_BLOCK = (1 / 9, 2 / 9, 3 / 9, 2 / 9, 1 / 9), 5
 # Parts of the log; part of the information that a part must have to count; smallest number of such parts.
@@ -132,7 +131,7 @@ def select_terms(means: MeanForces) -> tuple[SelectedTerm, ...]:
     """
     allowed = ~_equivalent_to_the_model(means)
     chosen: list[int] = []
-    while len(chosen) < _MOST:
+    while len(chosen) < 5:
         found = _Step.of(means, chosen).best(allowed)
         if found is None:
             break
