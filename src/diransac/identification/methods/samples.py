@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +14,7 @@ from diransac.errors import IdentificationError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.evaluation.scoring import Scoring, mean_squared_error, rms_error
 from diransac.identification.evaluation.simulation import Scores, Simulation, stretches_of
-from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function
-from diransac.simulation.compiler.vectors import Value
+from diransac.simulation.compiler.machine_code import LANES
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -263,22 +261,12 @@ def fingerprint(rows: IntArray, n_rows: int) -> bytes:
     return np.packbits(chosen).tobytes()
 
 
-# Six rounds pass a chi-square test of pairs of positions from 30 rows on; fewer rows need twelve.
-_ROUNDS, _ROUNDS_OF_FEW, _FEW_BITS = 6, 12, 3
-
-
-# Positions that are permuted at a time: the instructions of two vectors overlap.
-_AT_A_TIME = 2 * LANES
-
-
-_SIGNATURE = {
-    **dict.fromkeys(("iterations", "found"), "pointer"),
-    **dict.fromkeys(("seed", "n", "n_rows", "start", "stop", "width", "half", "n_rounds"), "integer"),
-}
-
-
 def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, stop: int) -> IntArray:
     """Positions ``start`` to ``stop`` of the keyed permutations of ``range(n_rows)``.
+
+    Sample ``k`` is the beginning of a pseudo-random permutation of the rows whose key is ``(seed, k)``.  No state is
+    carried from one sample to the next, a sample is extended by reading on, and all arithmetic is integer, so that
+    samples are the same on every machine.
 
     Parameters
     ----------
@@ -295,23 +283,33 @@ def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, s
     -------
     (n, stop - start) int array
         Distinct rows of the log for each sample; other positions of the same permutation do not repeat them.
+
+    References
+    ----------
+    Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway 2002
+    (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
+    (counter-based random numbers).
     """
-    k = np.ascontiguousarray(iterations, dtype=np.uint64)
     half = max(1, -(-(n_rows - 1).bit_length() // 2))
-    n_rounds = _ROUNDS_OF_FEW if half <= _FEW_BITS else _ROUNDS
-    found = np.empty((len(k), -(-(stop - start) // _AT_A_TIME) * _AT_A_TIME), np.int64)
-    sizes = (len(k), n_rows, start, stop, found.shape[1], half, n_rounds)
-    _code().call(k.ctypes.data, found.ctypes.data, int(seed) % 2**64, *sizes)
-    return found[:, : stop - start]
+    shift, low = np.uint64(half), np.uint64(2**half - 1)
+    of_sample = _mixed(_mixed(np.array([int(seed) % 2**64], np.uint64)) + np.asarray(iterations, np.uint64))
+    # Six rounds pass a chi-square test of pairs of positions from 30 rows on; fewer rows need twelve.
+    rounds = np.arange(1, 7 if half > 3 else 13, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    keys = _mixed(of_sample + rounds[:, None])
+    found = np.tile(np.arange(start, stop, dtype=np.uint64), (len(of_sample), 1))
+    sample, place = np.nonzero(np.ones(found.shape, bool))
+    while len(sample):  # numbers that the network takes out of the range are permuted again
+        left, right = found[sample, place] >> shift, found[sample, place] & low
+        for key in keys:
+            left, right = right, left ^ (_mixed(right + key[sample]) & low)
+        found[sample, place] = left << shift | right
+        outside = found[sample, place] >= n_rows
+        sample, place = sample[outside], place[outside]
+    return found.astype(np.int64)
 
 
-@cache
-def _code() -> MachineCode:
-    """Machine code for samples of any size."""
-
-    def emit() -> Value:
-        from diransac.simulation.compiler.feistel import emit_permutations
-
-        return emit_permutations("permutations", _ROUNDS_OF_FEW, _AT_A_TIME)
-
-    return compile_function(emit, (repr((_ROUNDS_OF_FEW, _AT_A_TIME)),), "permutations", _SIGNATURE.values())
+def _mixed(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """SplitMix64's finalizer, a bijection of 64-bit words."""
+    for places, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(places))) * np.uint64(factor)
+    return x ^ (x >> np.uint64(31))
