@@ -5,7 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, get_args
 
-__all__ = ["Finding", "Level", "Verdict", "by_seriousness", "next_line", "shown", "shown_lines", "verdict_of"]
+from diransac.identification.serialization import Form
+
+__all__ = [
+    "FAR",
+    "VALIDATE",
+    "Finding",
+    "Level",
+    "Verdict",
+    "by_seriousness",
+    "graded",
+    "next_line",
+    "shown",
+    "shown_lines",
+    "verdict_of",
+]
 
 
 Level = Literal["note", "good", "care", "bad"]
@@ -64,30 +78,22 @@ class Finding(str):
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> Finding:
         """The finding of `to_dict`; those of earlier versions have no action."""
-        action = data.get("action", "")
-        return cls(data["level"], data["text"].removesuffix(f"; {action}.") if action else data["text"], action)
+        text, action = data["text"], data.get("action", "")
+        if not (isinstance(text, str) and isinstance(action, str)):
+            raise TypeError("a finding that is no text")
+        return cls(data["level"], text.removesuffix(f"; {action}.") if action else text, action)
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, _source: object, _handler: object) -> Any:
+    def __get_pydantic_core_schema__(cls, source: object, handler: object) -> Any:
         """Form in JSON: that of `to_dict`."""
-        from pydantic_core import core_schema
-
-        text = core_schema.str_schema(strict=True)
-        fields = {
-            "level": core_schema.typed_dict_field(core_schema.literal_schema(list(get_args(Level)))),
-            "text": core_schema.typed_dict_field(text),
-            "action": core_schema.typed_dict_field(text, required=False),
-        }
-        return core_schema.no_info_after_validator_function(
-            cls._from_dict,
-            core_schema.typed_dict_schema(fields),
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda found: found.to_dict()),
-        )
+        return Form(cls.to_dict, cls._from_dict).__get_pydantic_core_schema__(source, handler)
 
 
 Verdict = Literal["usable", "usable with care", "do not rely on this"]
 
 
+FAR = 0.25
+"""Error of a prediction over the motion up to which a model needs care, and beyond which it is bad."""
 VALIDATE = "predict a log that it was not identified from: diransac validate RESULT.json OTHER_LOG"
 """Action for a result that nothing opposes."""
 
@@ -135,6 +141,11 @@ def next_line(findings: Iterable[Finding], otherwise: str = VALIDATE) -> str:
     """
     actions = [x.action for x in shown(findings)[0] if x.action]
     return f"Next: {(actions or [otherwise])[0]}."
+
+
+def graded(value: float, good: float, care: float) -> Level:
+    """Level of a value of which less is better."""
+    return "good" if value <= good else "care" if value <= care else "bad"
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:

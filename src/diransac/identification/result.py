@@ -86,8 +86,6 @@ class Result:
     fixed: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    # ------------------------------------------------------------------ parameters
-
     @cached_property
     def layout(self) -> ParameterLayout:
         """Places of each log's parameters in the estimate."""
@@ -113,13 +111,7 @@ class Result:
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
 
     def index_of(self, log: Log) -> int | None:
-        """Index of a log among those identified from; None if it is not one of them.
-
-        Raises
-        ------
-        SettingsError
-            What is given is no log.
-        """
+        """Index of a log among those identified from, or None.  Raises SettingsError: what is given is no log."""
         if not isinstance(log, Log):
             raise SettingsError(f"log is {log!r}; give a dr.Log (result.per_log has the parameters by index)")
         known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
@@ -364,8 +356,6 @@ class Result:
         """Unit of each parameter."""
         return {n: x.unit for n, x in self.model.parameters.items()}
 
-    # ------------------------------------------------------------------ estimate and evaluation by their names
-
     @property
     def unidentifiable(self) -> tuple[str, ...]:
         """Parameters that the logs do not determine, as lo-diransac finds; a per-log one if it is so in any log."""
@@ -442,8 +432,6 @@ class Result:
         """Inliers ``(N,)`` among the rows of the given logs, log after log."""
         return self.evaluation.inliers
 
-    # ------------------------------------------------------------------ logs
-
     def log_rows(self, i: int) -> slice:
         """Rows of log ``i`` among the rows of all logs."""
         begin = sum(log.n_rows for log in self.logs[:i])
@@ -455,8 +443,6 @@ class Result:
         parts = [log.start + log.dt * np.flatnonzero(self.inliers[self.log_rows(i)]) for i, log in enumerate(self.logs)]
         return np.concatenate(parts)
 
-    # ------------------------------------------------------------------ files
-
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; `from_dict` reads it back."""
         return result_files.as_dict(self)
@@ -465,52 +451,19 @@ class Result:
     def from_dict(cls, data: object) -> Result:
         """Result from the mapping that `to_dict` returned.
 
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Returns
-        -------
-        Result
-
-        Raises
-        ------
-        ResultError
-            The data are of another format, or damaged.
+        Raises ResultError: the data are of another format, or damaged.
         """
         return result_files.from_data(data, cls)
 
     def save(self, path: str | Path) -> None:
-        """Write the result as JSON, atomically.
-
-        Parameters
-        ----------
-        path : str or Path
-
-        Raises
-        ------
-        ResultError
-            The file cannot be written.
-        """
+        """Write the result as JSON, atomically.  Raises ResultError: the file cannot be written."""
         result_files.write(path, self._text())
 
     @classmethod
     def load(cls, path: str | Path) -> Result:
         """Result from a file that `save` wrote.
 
-        Parameters
-        ----------
-        path : str or Path
-
-        Returns
-        -------
-        Result
-
-        Raises
-        ------
-        ResultError
-            There is no such file, or it does not contain a result; the message names the file.
+        Raises ResultError: there is no such file, or it contains no result; the message names the file.
         """
         try:
             data = json_data(read_text(path))

@@ -16,10 +16,9 @@ from diransac.data.dataset import ParameterLayout
 from diransac.errors import ResultError, SettingsError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.estimate import Estimate, Evaluation, LogSummary
-from diransac.identification.finding import Finding, Verdict
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
-from diransac.identification.structure.lacking_terms import StructuralUncertainty, check_terms
+from diransac.identification.structure.lacking_terms import check_terms
 from diransac.model import Model
 from diransac.simulation import HOLDS
 
@@ -52,61 +51,38 @@ class _Provenance:
     priors: NumberPairs
 
 
-@dataclass(frozen=True)
-class _Public:
-    """Parameters of a result's JSON where some are per log: one value each, and the values of every log."""
-
-    parameters: Values
-    covariance: Numbers
-    per_log: Series
-
-
-@dataclass(frozen=True)
-class _Derived:
-    """Derived figures in a result's JSON, for programs that read it."""
-
-    units: Mapping[str, str]
-    standard_errors: Values
-    intervals_95: NumberPairs
-    structural_intervals_95: NumberPairs | None
-    structure: Mapping[str, StructuralUncertainty] | None
-    violations: tuple[str, ...]
-    verdict: Verdict
-    findings: tuple[Finding, ...]
-
-
 def as_dict(result: Result) -> dict[str, Any]:
-    """Everything, ready for JSON; `from_dict` reads it back."""
+    """Everything, ready for JSON; `from_data` reads it back."""
     estimate = dump(result.estimate)
     if not result.layout.is_shared:
-        full = {f"{key}_of_logs": estimate[key] for key in _BY_LOG}
-        estimate |= full | dump(
-            _Public(result.parameters, result.covariance, {n: np.array(x) for n, x in result.per_log.items()})
-        )
+        estimate |= {f"{key}_of_logs": estimate[key] for key in _BY_LOG}
+        estimate |= {"parameters": dump(result.parameters, Values), "covariance": dump(result.covariance, Numbers)}
+        estimate["per_log"] = dump({n: np.array(x) for n, x in result.per_log.items()}, Series)
     return {
         "format": _FORMAT,
         **estimate,
         **dump(result.evaluation),
         # Its notes hold the estimate's, too.
         **dump(_Provenance(**{n: getattr(result, n) for n in _Provenance.__dataclass_fields__})),
-        **dump(_derived(result)),
+        **_derived(result),
         "settings": result.settings.to_dict(),
         "model": result.model.to_dict(),
     }
 
 
-def _derived(result: Result) -> _Derived:
-    """Figures that follow from others."""
-    return _Derived(
-        result.units,
-        result.standard_errors,
-        result.intervals(),
-        result.structural_intervals() if result.has_structure else None,
-        result.structure if result.has_structure else None,
-        result.violations,
-        result.verdict,
-        result.findings,
-    )
+def _derived(result: Result) -> dict[str, Any]:
+    """Figures that follow from others, for programs that read the JSON."""
+    structural = result.structural_intervals() if result.has_structure else None
+    return {
+        "units": result.units,
+        "standard_errors": dump(result.standard_errors, Values),
+        "intervals_95": dump(result.intervals(), NumberPairs),
+        "structural_intervals_95": None if structural is None else dump(structural, NumberPairs),
+        "structure": {n: dump(x) for n, x in result.structure.items()} if result.has_structure else None,
+        "violations": list(result.violations),
+        "verdict": result.verdict,
+        "findings": [x.to_dict() for x in result.findings],
+    }
 
 
 def from_data(data: object, make: Callable[..., Result]) -> Result:

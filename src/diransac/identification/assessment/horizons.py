@@ -114,19 +114,17 @@ class _Sums:
     outliers: BoolArray
 
     @classmethod
-    def none(cls, n_s: int) -> _Sums:
-        """Those of no window."""
-        zeros: dict[str, Any] = {x.name: np.zeros(n_s) for x in fields(cls)}
+    def over(cls, parts: Sequence[_Sums], n_s: int) -> _Sums:
+        """The sums over the windows of all parts; of none, zeros."""
         samples = {"measured": np.empty((0, n_s)), "outliers": np.empty((0, n_s), bool)}
-        return cls(**{**zeros, "windows": 0, "diverged": 0, **samples})
-
-    def plus(self, other: _Sums) -> _Sums:
-        """The sums over the windows of both."""
-        sums: dict[str, Any] = {}
-        for name in (x.name for x in fields(self)):
-            a, b = getattr(self, name), getattr(other, name)
-            sums[name] = np.concatenate([a, b]) if name in ("measured", "outliers") else a + b
-        return _Sums(**sums)
+        totals: dict[str, Any] = {}
+        for name in (x.name for x in fields(cls)):
+            values = [getattr(x, name) for x in parts]
+            if name in samples:
+                totals[name] = np.concatenate([samples[name], *values])
+            else:
+                totals[name] = sum(values, 0 if name in ("windows", "diverged") else np.zeros(n_s))
+        return cls(**totals)
 
 
 class OpenLoop:
@@ -238,17 +236,15 @@ class OpenLoop:
 
     def sums(self, horizon: float) -> _Sums:
         """Sums over the windows of one horizon in all stretches between gaps."""
-        total = _Sums.none(self.segment.measured.shape[1])
-        for rows in self.stretches:
-            total = total.plus(self._sums(rows, self._steps(rows, horizon)))
-        return total
+        found = [self._sums(rows, self._steps(rows, horizon)) for rows in self.stretches]
+        return _Sums.over([x for x in found if x is not None], self.segment.measured.shape[1])
 
-    def _sums(self, rows: slice, steps: int) -> _Sums:
-        """Sums over windows, one after another; one that starts at an incomplete state is left out."""
+    def _sums(self, rows: slice, steps: int) -> _Sums | None:
+        """Sums over windows, one after another, from complete states; None without any."""
         begins = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
         begins = begins[self._complete[begins]]
         if not len(begins):
-            return _Sums.none(self.segment.measured.shape[1])
+            return None
         states, deviations = self.starts(rows, begins)
         at = begins[:, None] + np.arange(1, steps + 1)
         measured, outliers = self.segment.measured[at], self.outliers[at]
@@ -336,11 +332,11 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
     logs : sequence of OpenLoop
     """
     parts = [one.sums(horizon) for one in logs]
-    total = parts[0]
-    for part in parts[1:]:
-        total = total.plus(part)
-    spread = sum((_spread(x.measured) for x in parts), np.zeros(len(signals)))
-    regular = sum((_spread(np.where(x.outliers, np.nan, x.measured)) for x in parts), np.zeros(len(signals)))
+    total = _Sums.over(parts, len(signals))
+    spread = sum((_squares_about_mean(x.measured) for x in parts), np.zeros(len(signals)))
+    regular = sum(
+        (_squares_about_mean(np.where(x.outliers, np.nan, x.measured)) for x in parts), np.zeros(len(signals))
+    )
     model = logs[0].segment.model
     judged = np.array([n in model.state or n in model.sensors for n in signals])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -377,7 +373,7 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
     return HorizonScores(horizon, total.windows, total.diverged, *by_name, *of_moving)
 
 
-def _spread(measured: FloatArray) -> FloatArray:
+def _squares_about_mean(measured: FloatArray) -> FloatArray:
     """Sum of squares ``(n_s,)`` about the mean of the samples that are there."""
     present = np.isfinite(measured)
     mean = np.where(present, measured, 0.0).sum(axis=0) / np.maximum(present.sum(axis=0), 1)

@@ -229,7 +229,7 @@ def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
     """Statistics of a signal; its spikes are those of its continuous form, without wraps and changes of sign."""
     values = log[name]
     finite = values[np.isfinite(values)]
-    low, high, spread = (finite.min(), finite.max(), _spread(finite)) if len(finite) else (np.nan,) * 3
+    low, high, spread = (finite.min(), finite.max(), _standard_deviation(finite)) if len(finite) else (np.nan,) * 3
     apart = rows_per_sample(np.isfinite(values))
     run = _longest_run(values if apart == 1 else finite)
     frozen = run * apart * log.dt if run >= 10 else 0.0
@@ -239,7 +239,7 @@ def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
     return SignalFacts(log.units.get(name), float(low), float(high), float(spread), rate, n_missing, n_spikes, frozen)
 
 
-def _spread(values: FloatArray) -> float:
+def _standard_deviation(values: FloatArray) -> float:
     """Standard deviation, of numbers whose squares may overflow too."""
     scale = max(np.abs(values).max(), np.finfo(np.float64).tiny)
     return float(scale * (values / scale).std())

@@ -14,7 +14,16 @@ from diransac.errors import SettingsError
 from diransac.identification.assessment.horizons import HorizonScores, OpenLoop, StartRule, pooled_scores
 from diransac.identification.assessment.innovations import Innovations, innovations
 from diransac.identification.assessment.open_loop import resolution_of
-from diransac.identification.finding import Finding, Level, Verdict, by_seriousness, next_line, shown_lines, verdict_of
+from diransac.identification.finding import (
+    FAR,
+    Finding,
+    Verdict,
+    by_seriousness,
+    graded,
+    next_line,
+    shown_lines,
+    verdict_of,
+)
 from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned, listed, number, percent
@@ -23,8 +32,8 @@ __all__ = ["Validation", "validate"]
 
 _PARTS, _FEWEST_STEPS = (200.0, 50.0, 10.0), 5
 """Horizons are these parts of a log; samples of one at least."""
-_GOOD, _FAR = 0.1, 0.25
-"""Relative errors of predictions up to which a model is good, and needs care."""
+_GOOD = 0.1
+"""Relative error of predictions of held-out logs up to which a model is good."""
 _TELLING = 0.1
 """Sensitivity of predictions to 1 % of the parameters and to the start, up to which a horizon tells models apart."""
 _BEYOND, _SEEN = 3.0, 0.2
@@ -161,7 +170,7 @@ def _prediction(found: Validation) -> Iterator[Finding]:
     elif found.unsmoothed:
         where = f"a log, or its stretches between gaps, are too short ({listed(found.unsmoothed)})"
         yield Finding("care", f"Noise and starts are unknown where {where}", "give longer ones")
-    elif unseen or _FAR < worst <= _BEYOND * effect:
+    elif unseen or FAR < worst <= _BEYOND * effect:
         claim = f"Prediction over {over} tells little of the model, since {_cause(effect)}"
         yield Finding("care", claim, "give a shorter --horizon, or a log with less noise or more motion")
     else:
@@ -178,7 +187,7 @@ def _worst_state(errors: Mapping[str, float], over: str) -> Iterator[Finding]:
     if not x:
         yield Finding("good", f"Over {over} every state is predicted within its noise.")
         return
-    level: Level = "good" if x <= _GOOD else "care" if x <= _FAR else "bad"
+    level = graded(x, _GOOD, FAR)
     text = f"Over {over} the prediction of {name} is off by {percent(x)} of its motion, in excess of the noise"
     others = "; the other states are closer" if len(errors) > 1 else ""
     correct = "identify from this log, too, with --with-suggestions for terms that the model lacks"

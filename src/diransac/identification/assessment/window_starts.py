@@ -166,7 +166,7 @@ def window_starts(
     known: BoolArray = np.asarray(np.isfinite(measured) & ~smoothed.outliers)
     at = first[:, None] + np.arange(n_rows)
     fit = _Fit(simulation, parameters, first, n_rows, np.asarray(known[at]), states)
-    found, covariance, residual = fit.solved(states[first], _DIFFERENCE * _spread(measured))
+    found, covariance, residual = fit.solved(states[first], _DIFFERENCE * _width_of_bulk(measured))
     K, n_x = found.shape
     values, vectors = np.linalg.eigh(covariance)
     roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]).swapaxes(1, 2)
@@ -179,7 +179,7 @@ def window_starts(
     return WindowStarts(at_start, roots @ transition, residual)
 
 
-def _spread(values: FloatArray) -> FloatArray:
+def _width_of_bulk(values: FloatArray) -> FloatArray:
     """Range ``(n,)`` of the central 80 % of each column's finite values; 1 where it is 0."""
     found = [np.ptp(np.quantile(x[np.isfinite(x)], [0.1, 0.9])) if np.isfinite(x).any() else 0.0 for x in values.T]
     return np.array([x if x > 0.0 else 1.0 for x in found])
@@ -199,7 +199,7 @@ class _Fit:
     ) -> None:
         self._simulation, self._parameters, self._first = simulation, parameters, first
         self._n_rows, self._known = n_rows, known
-        self.difference = _DIFFERENCE * _spread(states)
+        self.difference = _DIFFERENCE * _width_of_bulk(states)
 
     def solved(self, states: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States ``(K, n_x)``, their covariances ``(K, n_x, n_x)``, and the residuals' scale ``(n_s,)``."""

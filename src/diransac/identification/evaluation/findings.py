@@ -9,7 +9,8 @@ import numpy as np
 
 from diransac.identification.diagnosis import departures
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.finding import VALIDATE, Finding, Level, by_seriousness
+from diransac.identification.finding import FAR, VALIDATE, Finding, Level, by_seriousness, graded
+from diransac.identification.regression.uncertainty import CLEAR
 from diransac.text_table import duration, number, percent, plural, share
 
 if TYPE_CHECKING:
@@ -22,15 +23,13 @@ if TYPE_CHECKING:
 __all__ = ["bounds_text", "findings_of"]
 
 
-_NEAR, _FAR = 0.05, 0.25
-"""Median errors of simulations, over the range of the signal, that are good, and that need care."""
+_NEAR = 0.05
+"""Median error of a simulation, over the range of the signal, up to which it is good."""
 _MOST, _HALF, _FEW = 0.7, 0.5, 0.01
 _WIDENED, _AMBIGUOUS = 2.0, 0.1
 """Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
-_CONTRADICTION = 3.0
-"""Distance of an estimate from the mean of its prior, in standard deviations of that, which needs care."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
 _STEADY, _UNSTEADY = 0.05, 0.2
 """Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
@@ -69,11 +68,6 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     if cause is None:
         return found
     return tuple(Finding(x.level, x.claim, cause.action) if x.action else x for x in found)
-
-
-def _graded(value: float, good: float, care: float) -> Level:
-    """Level of a value of which less is better."""
-    return "good" if value <= good else "care" if value <= care else "bad"
 
 
 # ---------------------------------------------------------------------- bounds
@@ -128,7 +122,7 @@ def _known(result: Result) -> Iterator[Finding]:
     for name, x in result.estimate.parameters.items():
         mean, std = result.priors.get(name.partition("[")[0], (np.nan, np.nan))
         away = abs(x - mean) / std
-        if away > _CONTRADICTION:
+        if away > CLEAR:
             text = (
                 f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
             )
@@ -210,7 +204,7 @@ def _median_error(result: Result, found: Prediction, where: str) -> Finding:
     """Finding on the signal with the largest median error of a simulation."""
     errors = found.relative_errors
     name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
-    level = _graded(errors[name], _NEAR, _FAR)
+    level = graded(errors[name], _NEAR, FAR)
     what = share(errors[name], "its range")
     if restarted:
         method = f"simulations restarted every {number(found.restart_period)} s"
@@ -326,7 +320,7 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     left = found.unexplained[name]
     others = ", less of the others" if len(found.unexplained) > 1 else ""
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
-    level = _graded(left, _NEAR, _HALF)
+    level = graded(left, _NEAR, _HALF)
     yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 
@@ -419,7 +413,7 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
     change = max(map(abs, changes[name]))
     if change > _STEADY:
         claim = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
-        yield Finding(_graded(change, _STEADY, _UNSTEADY), claim, _OTHER_BANDWIDTH)
+        yield Finding(graded(change, _STEADY, _UNSTEADY), claim, _OTHER_BANDWIDTH)
         return
     text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
     yield Finding("good", text)

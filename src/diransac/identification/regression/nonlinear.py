@@ -124,7 +124,7 @@ class BoundNonlinear:
         self._missing = np.isnan(self._measured)
         self._log_of_row = np.repeat(np.arange(len(parts)), [len(x) for x, _, _ in parts])
         self._scale = np.sqrt(np.square(self._measured[:, : len(known)]).mean(axis=0))
-        self._scale = np.append(self._scale, _spreads(self._measured[:, len(known) :]))
+        self._scale = np.append(self._scale, _standard_deviations(self._measured[:, len(known) :]))
         self._scale[self._scale == 0.0] = 1.0
         self._chart = ParameterChart(self._layout.bounds)
         self._evaluate = _compiled(model, known, shown)
@@ -393,7 +393,7 @@ def _usable(one: Segment, known: Sequence[int], shown: Sequence[int]) -> tuple[F
     return np.hstack([q, v]), one.acting_inputs()[one.valid], measured
 
 
-def _spreads(sensors: FloatArray) -> list[float]:
+def _standard_deviations(sensors: FloatArray) -> list[float]:
     """Standard deviation of the finite values of each sensor; 0 without any."""
     finite = [x[np.isfinite(x)] for x in sensors.T]
     return [float(x.std()) if len(x) else 0.0 for x in finite]

@@ -17,6 +17,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
+from diransac.identification.regression.uncertainty import CLEAR
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ __all__ = [
 _STEPS, _FAR = 10, 3.0
 # Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
 _ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY, _ROUNDING = 5000, 1000, 1e150, 1e-300, 1e-9
-# Standard errors of an estimate outside of its bounds that are no chance; batches of rows for them.
-_CLEARLY, _BATCHES = 3.0, 30
+# Batches of rows for standard errors.
+_BATCHES = 30
 
 
 @dataclass(frozen=True)
@@ -213,7 +214,7 @@ def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
     """
     lower, upper = np.array([(max(x.lower, 0.0) if x.positive else x.lower, x.upper) for x in layout.bounds]).T
     nearest = np.clip(found.parameters, lower, upper)
-    far = np.abs(found.parameters - nearest) > _CLEARLY * found.errors
+    far = np.abs(found.parameters - nearest) > CLEAR * found.errors
     outside = set(layout.violations(found.parameters))
     return [n for n, x in zip(layout.names, far, strict=True) if n in outside and x]
 

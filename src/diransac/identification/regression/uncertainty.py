@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from diransac.model import Parameter
 
 __all__ = [
+    "CLEAR",
     "N_BLOCKS",
     "combined",
     "jackknife_covariance",
@@ -32,6 +33,8 @@ __all__ = [
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
 # (tests/test_uncertainty.py), 0.3 s of a log of 25 s; with 30 stretches it would be 0.1 s.
 N_BLOCKS = 10
+CLEAR = 3.0
+"""Standard errors from which on a difference is no chance."""
 # Standard deviations of a normal distribution beyond which nothing lies, to rounding errors; points of a quadrature.
 _FAR, _N_POINTS = 9.0, 100
 # Draws at a time, and the least fraction of them that is within the bounds.
