@@ -27,7 +27,6 @@ from diransac.text_table import aligned, percent
 
 if TYPE_CHECKING:
     from diransac.data.log import Log
-    from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Model
 
 __all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
@@ -207,7 +206,7 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
-    fitness = None if model is None else dataclasses.replace(_fitness(log, model), bases=_bases(log, model))
+    fitness = None if model is None else _fitness(log, model)
     if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
         mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, [log]))
         fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, _caveat(signals, model)])))
@@ -265,28 +264,19 @@ def _fitness(log: Log, model: Model) -> Fitness:
     missing = tuple(name for name in model.required_signals if name not in log)
     derived = _derived(log, model) if missing else log
     derivable = tuple(name for name in missing if name in derived)
+    excitation, reason = dict[str, Excitation](), ""
     if derivable != missing:
         later = "lo-diransac estimates them; excitation is known only after identification"
-        return Fitness(model.name, missing, derivable, {}, "" if set(missing) & set(model.inputs) else later)
-    if model.nonlinear_parameters:
+        reason = "" if set(missing) & set(model.inputs) else later
+    elif model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)
-        return Fitness(
-            model.name, missing, derivable, {}, f"not affine in {names}: excitation is known only after identification"
-        )
-    try:
-        model = model.with_sensors(usable_sensors(model, [derived], regression=True)[0])
-        dataset = Dataset.of(model, derived)
-        check_motion(dataset)
-        ambiguous = structural(model, ranges=dataset.ranges)
-        if ambiguous:
-            reason = "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
-            return Fitness(model.name, missing, derivable, _not_excited(ambiguous, model), reason)
-        excitation, reason = _excitation(OrdinaryLeastSquares().bind(dataset), model)
-        if not reason:
-            choose_scoring(dataset, Settings())  # raises for a log that cannot be scored, as identify does
-    except (LogError, IdentificationError) as error:
-        return Fitness(model.name, missing, derivable, {}, str(error))
-    return Fitness(model.name, missing, derivable, excitation, reason)
+        reason = f"not affine in {names}: excitation is known only after identification"
+    else:
+        try:
+            excitation, reason = _excitation(model, derived)
+        except (LogError, IdentificationError) as error:
+            reason = str(error)
+    return Fitness(model.name, missing, derivable, excitation, reason, bases=_bases(log, model))
 
 
 def _bases(log: Log, model: Model) -> dict[str, str]:
@@ -317,16 +307,26 @@ def _not_excited(ambiguous: Sequence[Ambiguity], model: Model) -> dict[str, Exci
     return {name: Excitation(model.parameters[name].unit, np.nan, np.inf) for name in names}
 
 
-def _excitation(bound: BoundEstimator, model: Model) -> tuple[dict[str, Excitation], str]:
-    """Excitation of each parameter; where some are not identifiable, of those alone, with the reason."""
-    names, units = list(model.parameters), [parameter.unit for parameter in model.parameters.values()]
+def _excitation(model: Model, log: Log) -> tuple[dict[str, Excitation], str]:
+    """Excitation of each parameter; where some are not identifiable, of those alone, with the reason.
+
+    Raises LogError, IdentificationError: nothing can be identified from the log, or it cannot be scored.
+    """
+    model = model.with_sensors(usable_sensors(model, [log], regression=True)[0])
+    dataset = Dataset.of(model, log)
+    check_motion(dataset)
+    ambiguous = structural(model, ranges=dataset.ranges)
+    if ambiguous:
+        return _not_excited(ambiguous, model), "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
+    bound = OrdinaryLeastSquares().bind(dataset)
     rows = np.arange(bound.n_rows)
     selected = bound.select([rows])
     if not selected.well_defined()[0]:
-        ambiguous = of_log(names, bound.null_space())
+        ambiguous = of_log(list(model.parameters), bound.null_space())
         return _not_excited(ambiguous, model), in_words(ambiguous, 1)
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
-    relative = np.divide(errors, np.abs(estimates), out=np.full(len(names), np.inf), where=estimates != 0.0)
-    rated = zip(names, units, estimates, relative, strict=True)
-    return {name: Excitation(unit, float(x), float(e)) for name, unit, x, e in rated}, ""
+    relative = np.divide(errors, np.abs(estimates), out=np.full(len(errors), np.inf), where=estimates != 0.0)
+    choose_scoring(dataset, Settings())
+    rated = zip(model.parameters.items(), estimates.tolist(), relative.tolist(), strict=True)
+    return {name: Excitation(parameter.unit, x, error) for (name, parameter), x, error in rated}, ""

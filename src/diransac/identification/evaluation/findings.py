@@ -38,8 +38,9 @@ _STEADY, _UNSTEADY = 0.05, 0.2
 def findings_of(result: Result) -> tuple[Finding, ...]:
     """Findings on a result, the most serious first.
 
-    They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its diagnosis
-    and the checks of its method.  Where a mistake of a column explains what is bad, all findings have its action.
+    They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its
+    diagnosis. Those that need the logs or the fit itself are made with it, and stored: `Estimate.checks` and
+    `Estimate.mistakes`. Where a mistake of a column explains what is bad, all findings have its action.
 
     Parameters
     ----------

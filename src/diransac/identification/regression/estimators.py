@@ -330,6 +330,30 @@ class BoundSums:
         return gram
 
 
+class _OfRows(Protocol):
+    """An estimator that tests and fits sets of rows."""
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        """Mask of the sets that determine the parameters."""
+
+    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Parameters ``(n_sets, n)``."""
+
+
+@dataclass(frozen=True)
+class SelectedRows:
+    """Sets of rows, for an estimator that fits more than sums."""
+
+    bound: _OfRows
+    row_sets: Sequence[IntArray]
+
+    def well_defined(self) -> BoolArray:
+        return self.bound.well_defined(self.row_sets)
+
+    def fit(self) -> FloatArray:
+        return self.bound.fit(self.row_sets)
+
+
 @dataclass(frozen=True)
 class SelectedSums:
     """Sums of ``[W b]^T [W b]`` over each set of rows, ``(n_sets, n + 1, n + 1)``, and the number of rows."""

@@ -23,6 +23,7 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError
 from diransac.identification.regression.estimators import (
     OrdinaryLeastSquares,
+    SelectedRows,
     correlations,
     smallest_eigenvalue,
     solve_definite,
@@ -150,8 +151,8 @@ class BoundNonlinear:
             scores = np.einsum("nri,nr->ni", J, np.nan_to_num(errors))
             self._inflation = score_inflation(scores, self._blocks.sum(axis=0), float(np.square(errors).mean()))
 
-    def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
-        return _SelectedRows(self, row_sets)
+    def select(self, row_sets: Sequence[IntArray]) -> SelectedRows:
+        return SelectedRows(self, row_sets)
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         """Mask of the sets of rows in which the Jacobian at the fit of all rows has full rank."""
@@ -368,20 +369,6 @@ class _PriorErrors:
         J = np.zeros((*self.weight.shape, p.shape[1]))
         J[:, np.arange(len(self.places)), self.places] = self.weight * slope[:, self.places]
         return self.weight * (p[:, self.places] - self.mean), J
-
-
-@dataclass(frozen=True)
-class _SelectedRows:
-    """Sets of rows for nonlinear least squares."""
-
-    bound: BoundNonlinear
-    row_sets: Sequence[IntArray]
-
-    def well_defined(self) -> BoolArray:
-        return self.bound.well_defined(self.row_sets)
-
-    def fit(self) -> FloatArray:
-        return self.bound.fit(self.row_sets)
 
 
 def _usable(one: Segment, known: Sequence[int], shown: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -15,7 +15,7 @@ from diransac.identification.regression.estimators import (
     BoundSums,
     Estimator,
     OrdinaryLeastSquares,
-    SelectedSums,
+    SelectedRows,
     column_scale,
 )
 from diransac.identification.regression.rows import NullSpace, regression
@@ -80,8 +80,12 @@ class _BoundScikitLearn:
         self._scale = np.where(scale > 0.0, scale, 1.0)
         self._W, self._b = W / self._scale[:-1], b / self._scale[-1]
 
-    def select(self, row_sets: Sequence[IntArray]) -> _SelectedRows:
-        return _SelectedRows(self._sums.select(row_sets), self, row_sets)
+    def select(self, row_sets: Sequence[IntArray]) -> SelectedRows:
+        return SelectedRows(self, row_sets)
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        """Mask of the sets of rows that determine the parameters, by their sums."""
+        return self._sums.select(row_sets).well_defined()
 
     def null_space(self) -> NullSpace:
         return self._sums.null_space()
@@ -117,21 +121,6 @@ class _BoundScikitLearn:
             return np.full(n_p, np.nan)
         holder = getattr(fitted, "estimator_", fitted)
         return np.asarray(holder.coef_, dtype=float).reshape(n_p)
-
-
-@dataclass(frozen=True)
-class _SelectedRows:
-    """Sets of rows for a scikit-learn regressor."""
-
-    sums: SelectedSums
-    bound: _BoundScikitLearn
-    row_sets: Sequence[IntArray]
-
-    def well_defined(self) -> BoolArray:
-        return self.sums.well_defined()
-
-    def fit(self) -> FloatArray:
-        return self.bound.fit(self.row_sets)
 
 
 def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
