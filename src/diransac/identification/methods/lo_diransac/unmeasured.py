@@ -1,7 +1,7 @@
 """Trajectories of states that no signal measures, such as the thrust behind the lag of a motor.
 
 Simulations that the smoothed motion of all other states drives, and the smoothed sensors, give parameters and
-trajectories (`driven_states`).  The best of them simulates the shooting intervals best, by the scores of
+trajectories (`regression.observers`).  The best of them simulates the shooting intervals best, by the scores of
 hypotheses. Its trajectories take the place of smoothed signals until shooting estimates these states with all others.
 """
 
