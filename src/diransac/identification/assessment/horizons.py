@@ -25,12 +25,8 @@ __all__ = ["HorizonScores", "OpenLoop", "StartRule", "derived_velocities", "pool
 
 StartRule = Literal["smoothed", "measured"]
 
-# Memory of the observers that find unmeasured initial states, over the duration of the log; steps of their search.
-_MEMORY, _N_STEPS = 0.05, 20
-_CHANGE, _N_PROBES = 0.01, 4
-"""Relative change of the parameters whose effect on a prediction is its sensitivity; number of its random signs."""
-_FITTED = 2.0
-"""Numbers that a short simulation fits to the samples of a signal."""
+_N_PROBES = 4
+"""Random signs of the changes whose effect on a prediction is its sensitivity."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +182,8 @@ class OpenLoop:
         every = max(1, (stretch.stop - stretch.start) // 40)
         rows = np.arange(stretch.start, stretch.stop, every)
         samples = self.smoothed.samples
-        freedom = np.where(samples > 2 * _FITTED, 1.0 - _FITTED / np.maximum(samples, 2 * _FITTED), np.nan)
+        # A short simulation fits two numbers to the samples of a signal.
+        freedom = np.where(samples > 4.0, 1.0 - 2.0 / np.maximum(samples, 4.0), np.nan)
         return np.fmin(self.smoothed.noise, self._estimated(stretch, rows).residual / np.sqrt(freedom))
 
     def _estimated(self, stretch: slice, rows: IntArray) -> WindowStarts:
@@ -296,7 +293,7 @@ class OpenLoop:
         of_starts, of_parameters = np.zeros(errors.shape), np.zeros(errors.shape)
         for sign in signs:
             shifted = states + np.einsum("j,kji->ki", sign[: states.shape[1]], deviations)
-            changed = self.parameters * (1.0 + _CHANGE * sign[states.shape[1] :])
+            changed = self.parameters * (1.0 + 0.01 * sign[states.shape[1] :])
             with np.errstate(over="ignore", invalid="ignore"):
                 if deviations.any():
                     of_starts += np.square(self._errors(self.parameters, shifted, rows, errors.shape[1]) - errors)
@@ -439,10 +436,11 @@ def _unmeasured(
     spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
     weights = np.where(seen, 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
     readings = np.nan_to_num(compared[:, len(observed) :])
-    bandwidth = 1.0 / (_MEMORY * len(segment) * segment.log.dt)
+    # The observers forget within a twentieth of the log.
+    bandwidth = 1.0 / (0.05 * len(segment) * segment.log.dt)
     whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
     problem = DrivenStates(
         model, alone, hidden, known, segment.inputs, readings, weights, whole, segment.log.dt, bandwidth, parameters
     )
-    found = problem.trajectories(least_squares(problem, problem.starts(), _N_STEPS)[0][0])
+    found = problem.trajectories(least_squares(problem, problem.starts(), 20)[0][0])
     return np.column_stack([found[n] for n in hidden])

@@ -26,13 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Innovations", "innovations"]
 
-_LONGEST, _FEWEST = 3000, 50
-"""Rows of a log that are filtered at most and at least."""
 _SIZES = np.array([0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0])
 """Sizes of unmodelled forces that are tried, over the RMS change of a velocity from sample to sample."""
 _N_LAGS, _SETTLED = 20, 0.1
 """Lags of the autocorrelation; part of the rows in which the filter settles, which does not count."""
-_DIFFERENCE, _LEAST_NOISE, _FIRST = 1e-6, 1e-4, 0.1
 
 
 @dataclass(frozen=True)
@@ -132,21 +129,21 @@ def innovations(one: OpenLoop) -> Innovations | None:
     Parameters
     ----------
     one : OpenLoop
-        With smoothed states.  At most 3000 rows are filtered.
+        With smoothed states.  At most 3000 rows are filtered, and at least 50.
     """
     if one.smoothed is None:
         return None
     stretch = max(one.stretches, key=lambda x: x.stop - x.start)
-    rows = slice(stretch.start, min(stretch.stop, stretch.start + _LONGEST))
+    rows = slice(stretch.start, min(stretch.stop, stretch.start + 3000))
     segment, n = one.segment, rows.stop - rows.start
     states, spread = one.filled_states()[rows], np.maximum(np.nanstd(segment.measured, axis=0), 1e-300)
     measured = np.where(one.outliers, np.nan, segment.measured)[rows]
     counted = measured[int(_SETTLED * (n - 1)) : -1]
     seen = [i for i, x in enumerate(counted.T) if np.isfinite(x).sum() > _N_LAGS]
-    if n < _FEWEST or not seen:
+    if n < 50 or not seen:
         return None
     columns = [segment.model.signals.index(segment.signals[i]) for i in seen]
-    steps = _DIFFERENCE * np.maximum(np.std(states, axis=0), 1e-6)
+    steps = 1e-6 * np.maximum(np.std(states, axis=0), 1e-6)
     moved = np.concatenate([states[:, None], states[:, None] + steps * np.eye(states.shape[1])], axis=1)
     begins = np.repeat(np.arange(rows.start, rows.stop - 1), moved.shape[1])
     found = one.simulation.trajectories(0, one.parameters, moved[:-1].reshape(len(begins), -1), begins, 2)
@@ -154,11 +151,11 @@ def innovations(one: OpenLoop) -> Innovations | None:
     following, now = found[:, :, 1, : states.shape[1]], found[:, :, 0][:, :, columns]
     if not (np.isfinite(following).all() and np.isfinite(now).all()):
         return None
-    noise = np.maximum(one.noise, _LEAST_NOISE * spread)[seen]
+    noise = np.maximum(one.noise, 1e-4 * spread)[seen]
     F, H = (np.moveaxis(x[:, 1:] - x[:, :1], 1, 2) / steps for x in (following, now))
     residuals = measured[:-1][:, seen] - now[:, 0]
     change = np.std(np.diff(states, axis=0), axis=0) * (np.arange(states.shape[1]) >= segment.model.n_q)
-    start = np.square(_FIRST * np.std(states, axis=0) + 1e-12)
+    start = np.square(0.1 * np.std(states, axis=0) + 1e-12)
     drift = following[:, 0] - states[1:]
     try:
         with np.errstate(over="ignore", invalid="ignore"):

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
 
 
-_WELL, _WEAKLY = 0.1, 0.5
-
-
 @dataclass(frozen=True)
 class SignalFacts:
     """One signal of a log.
@@ -86,7 +83,7 @@ class Excitation:
     @property
     def verdict(self) -> str:
         """Degree of excitation: "well" (relative error below 10 %), "weakly" (below 50 %) or "not"."""
-        return "well" if self.relative_error < _WELL else "weakly" if self.relative_error < _WEAKLY else "not"
+        return "well" if self.relative_error < 0.1 else "weakly" if self.relative_error < 0.5 else "not"
 
 
 @dataclass(frozen=True)

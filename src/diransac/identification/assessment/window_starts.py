@@ -33,10 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["SmoothedLog", "WindowStarts", "smoothed_log", "window_starts"]
 
-_DENSE = 20.0
-"""Samples from which on smoothing leaves their noise."""
-_STEPS, _CONVERGED, _SHORTEST_STEP = 20, 1e-12, 0.05
-"""Gauss-Newton steps, relative decrease of the loss below which it has converged, and the shortest part of a step."""
+_STEPS = 20
+"""Gauss-Newton steps."""
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
 _SOFT = 3.0
@@ -88,7 +86,8 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     known: BoolArray = np.isfinite(distances)
     samples = known.mean(axis=0) * min(2 * intervals.length + 1, len(one))
     of_motion = lower_scale(np.where(known, distances, 0.0), known)
-    noise = np.where(samples < _DENSE, _of_pseudo_residuals(one.measured), np.nan_to_num(of_motion))
+    # Smoothing over 20 samples leaves their noise.
+    noise = np.where(samples < 20.0, _of_pseudo_residuals(one.measured), np.nan_to_num(of_motion))
     # Smaller distances are errors of the smoothed motion.
     least = 1e-3 * motion.spread[columns]
     # Outliers are six standard deviations of the noise from the motion.
@@ -219,11 +218,11 @@ class _Fit:
             moved = states - part[:, None] * np.linalg.solve(scaled, (g / d)[:, :, None])[:, :, 0] / d
             tried = self._errors(moved[:, None])[:, 0]
             old, new = self._loss(errors, scale), self._loss(tried, scale)
-            better = new < old * (1.0 - _CONVERGED)
+            better = new < old * (1.0 - 1e-12)
             states = np.where(better[:, None], moved, states)
             errors = np.where(better[:, None, None], tried, errors)
             part = np.where(better, np.minimum(2.0 * part, 1.0), 0.3 * part)  # friction bends the loss within a step
-            if part.max() < _SHORTEST_STEP:
+            if part.max() < 0.05:
                 break
         inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True)
         return states, inverse / d[:, :, None] / d[:, None, :], scale

@@ -36,9 +36,6 @@ __all__ = [
     "unexplained",
 ]
 
-_MEDIAN = 0.6745  # of the absolute value of Gaussian noise, in standard deviations
-_N_WINDOWS, _ROWS_PER_WINDOW = 40, 25
-
 
 # ---------------------------------------------------------------------- simulations
 
@@ -232,13 +229,14 @@ class SimulatedLog:
         """
         noise = self.noise.get(name, 0.0)
         if noise <= 0.5 * width:
-            return max(0.0, self.median_errors[name] - _MEDIAN * noise)
+            median_of_noise = 0.6745 * noise  # the absolute value of Gaussian noise
+            return max(0.0, self.median_errors[name] - median_of_noise)
         return float(np.median(self._absolute_errors(name, np.ones_like(self.inliers))))
 
     def windows(self) -> tuple[IntArray, FloatArray]:
-        """Edges ``(n + 1,)`` of windows over the rows, and the inlier fraction ``(n,)`` of those that count."""
+        """Edges ``(n + 1,)`` of up to 40 windows over the rows, and their inlier fractions ``(n,)``."""
         n, valid = len(self.observations), self.observations.valid
-        edges = np.unique(np.linspace(0, n, min(_N_WINDOWS, max(1, n // _ROWS_PER_WINDOW)) + 1).astype(int))
+        edges = np.unique(np.linspace(0, n, min(40, max(1, n // 25)) + 1).astype(int))
         inliers, counting = (np.add.reduceat(x.astype(float), edges[:-1]) for x in (self.inliers, valid))
         return edges, np.where(counting > 0.0, inliers / np.maximum(counting, 1.0), np.nan)
 

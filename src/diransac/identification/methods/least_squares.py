@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LeastSquares", "bound_to", "fitted"]
 
-_NAMES = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
-
 
 @dataclass(frozen=True)
 class LeastSquares:
@@ -70,7 +68,8 @@ class LeastSquares:
     def name(self) -> str:
         """``"ols"``, ``"tls"``, ``"nls"``, or the name of the estimator's class."""
         known = name_of(self._estimator)
-        return _NAMES.get(known, known)
+        names = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
+        return names.get(known, known)
 
     @property
     def _estimator(self) -> Estimator:

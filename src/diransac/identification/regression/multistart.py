@@ -16,9 +16,6 @@ from diransac.time_limit import check_time
 
 __all__ = ["LeastSquaresProblem", "least_squares"]
 
-# Damping at the start, its bounds, and its factors after a step down and after one up; the least gain of a step.
-_DAMPING, _DAMPING_BOUNDS, _LESS, _MORE, _CONVERGED = 1e-2, (1e-9, 1e9), 0.2, 6.0, 1e-9
-
 
 class LeastSquaresProblem(Protocol):
     """Sums of squares of many lanes."""
@@ -52,7 +49,7 @@ def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> 
     TimeLimitError
         The time limit was reached.
     """
-    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), _DAMPING)
+    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), 1e-2)
     for _ in range(n_steps):
         check_time()
         scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
@@ -61,13 +58,13 @@ def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> 
         trial = problem.moved(z, step)
         then = problem.linearized(trial)
         better = then[0] < cost
-        settled = better & (then[0] > (1.0 - _CONVERGED) * cost) | (damping >= _DAMPING_BOUNDS[1])
+        settled = better & (then[0] > (1.0 - 1e-9) * cost) | (damping >= 1e9)
         z = np.where(better[:, None], trial, z)
         cost, gradient, matrix = (
             np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
             for x, y in zip((cost, gradient, matrix), then, strict=True)
         )
-        damping = np.clip(np.where(better, _LESS, _MORE) * damping, *_DAMPING_BOUNDS)
+        damping = np.clip(np.where(better, 0.2, 6.0) * damping, 1e-9, 1e9)
         if settled.all():
             break
     return z, cost

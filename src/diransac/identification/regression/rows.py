@@ -40,12 +40,7 @@ __all__ = [
     "solved",
 ]
 
-# Steps of iteratively reweighted least squares, and the residual, in median ones, from which on a row counts less.
-_STEPS, _FAR = 10, 3.0
-# Rows of a log that are enough to find a cause, and for ranks; size from which on the square of a number overflows.
-_ENOUGH_ROWS, _FEW_ROWS, _HUGE, _TINY, _ROUNDING = 5000, 1000, 1e150, 1e-300, 1e-9
-# Batches of rows for standard errors.
-_BATCHES = 30
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -134,14 +129,14 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     rows = rows / scale
     A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
     weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
-    for _ in range(_STEPS):
+    for _ in range(10):
         p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
         residuals = np.abs(A @ p - y)
         if not np.isfinite(residuals).all():
             return None
         # Each equation has its own residuals: zeros satisfy one without a known term, and would outweigh the others.
         middle = np.median(residuals.reshape(-1, n_equations), axis=0) + _TINY
-        weights = 1.0 / (1.0 + np.square(residuals.reshape(-1, n_equations) / (_FAR * middle))).ravel()
+        weights = 1.0 / (1.0 + np.square(residuals.reshape(-1, n_equations) / (3.0 * middle))).ravel()
     whole = np.abs(A) @ np.abs(p) + np.abs(y)
     sizes = (np.median(x.reshape(-1, n_equations), axis=0) + _TINY for x in (residuals, whole))
     # The information at the solution: rows that are outliers there inform of nothing.
@@ -160,8 +155,8 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
 
 
 def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Standard errors ``(n,)`` of least squares, from sums of scores over batches of rows, in their order."""
-    sums = np.add.reduceat(A * residuals[:, None], np.arange(0, len(A), max(1, len(A) // _BATCHES)), axis=0)
+    """Standard errors ``(n,)`` of least squares, from sums of scores over 30 batches of rows, in their order."""
+    sums = np.add.reduceat(A * residuals[:, None], np.arange(0, len(A), max(1, len(A) // 30)), axis=0)
     H = A.T @ A
     inverse = np.linalg.pinv(H, hermitian=True)
     found = np.sqrt(np.square(sums @ inverse).sum(axis=0))
@@ -172,13 +167,13 @@ def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]
     """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit size; number of equations."""
     parts = []
     for i, one in enumerate(logs):
-        every = max(1, len(one.q) // _ENOUGH_ROWS)
+        every = max(1, len(one.q) // 5000)  # enough to find a cause
         few = (np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y))
         W, b = regression_rows(model, *few)
         W = layout.scattered(W, i)
         parts.append(np.concatenate([W, b[:, :, None]], axis=2))
     rows = np.concatenate(parts)
-    rows = rows[(np.abs(rows) < _HUGE).all(axis=(1, 2))]
+    rows = rows[(np.abs(rows) < 1e150).all(axis=(1, 2))]  # whose squares do not overflow
     if not len(rows):
         return np.empty((0, rows.shape[2])), rows.shape[1]
     return (rows / _sizes(rows)[:, None]).reshape(-1, rows.shape[2]), rows.shape[1]
@@ -192,7 +187,7 @@ def _sizes(rows: FloatArray) -> FloatArray:
     """
     W, b = rows[:, :, :-1], np.abs(rows[:, :, -1])
     size = np.array([np.median(x[x > 0.0]) if x.any() else 0.0 for x in b.T])
-    size = np.where(size > _ROUNDING * size.max(), size, 0.0)
+    size = np.where(size > 1e-9 * size.max(), size, 0.0)
     known = size > 0.0
     if known.any() and not known.all():
         A, y = ((x[:, known] / size[known, None]).reshape(-1, x.shape[2]) for x in (W, rows[:, :, -1:]))
@@ -232,7 +227,7 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
     """
     slope, parts = residual_slopes(model), []
     for i, one in enumerate(rows):
-        every = max(1, len(one.q) // _FEW_ROWS)
+        every = max(1, len(one.q) // 1000)  # enough for ranks
         p = layout.of_log(parameters, i)
         motion = (x[::every].T for x in (one.q, one.v, one.a, one.u))
         n = len(one.q[::every])

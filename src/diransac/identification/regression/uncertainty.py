@@ -35,10 +35,10 @@ __all__ = [
 N_BLOCKS = 10
 CLEAR = 3.0
 """Standard errors from which on a difference is no chance."""
-# Standard deviations of a normal distribution beyond which nothing lies, to rounding errors; points of a quadrature.
-_FAR, _N_POINTS = 9.0, 100
-# Draws at a time, and the least fraction of them that is within the bounds.
-_N_DRAWS, _LEAST_INSIDE = 1000, 1e-3
+# Points of a quadrature.
+_N_POINTS = 100
+# Draws at a time.
+_N_DRAWS = 1000
 
 
 def jackknife_covariance(
@@ -197,7 +197,7 @@ def students_draws(
         draws = mean[:, None] + normal / np.sqrt(rng.chisquare(degrees_of_freedom, _N_DRAWS) / degrees_of_freedom)
         inside = np.all([x.admits(own) for x, own in zip(bounds, draws, strict=True)], axis=0)
         kept, n_drawn = np.hstack([kept, draws[:, inside]]), n_drawn + _N_DRAWS
-        if kept.shape[1] < _LEAST_INSIDE * n_drawn:
+        if kept.shape[1] < 1e-3 * n_drawn:
             raise ResultError(
                 f"{kept.shape[1]} of {n_drawn} draws are within the bounds of the parameters; identify from more data, "
                 "or fix the parameters that are uncertain"
@@ -232,7 +232,8 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
     def integral(theta: float) -> float:
         return 0.5 * theta * float(weights @ density(0.5 * theta * (points + 1.0)))
 
-    whole, theta = integral(min(0.5 * math.pi, _FAR / math.sqrt(n))), 0.0
+    # Beyond nine standard deviations a normal distribution has nothing, to rounding errors.
+    whole, theta = integral(min(0.5 * math.pi, 9.0 / math.sqrt(n))), 0.0
     for _ in range(_N_POINTS):
         step = ((2.0 * probability - 1.0) * whole - integral(theta)) / float(density(theta))
         theta += step

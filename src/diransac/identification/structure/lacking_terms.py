@@ -38,7 +38,6 @@ __all__ = [
     "with_terms",
 ]
 
-_BISECTIONS, _ROUNDING, _LARGEST = 60, 1e-9, 1e100
 INPUT_GAIN, _RICHER = "input gain", "richer motion of {place}"
 INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
 """Kinds of the terms that change an input."""
@@ -66,11 +65,6 @@ KINDS = {
 
 {force} is a force along or a torque about a coordinate, or what acts on a velocity.
 """
-_PREFIXES = {
-    "harmonic ": "a wider range of {other}",
-    "gravity ": "a wider range of {other}",
-    "coupling ": "motion in which {other} and {place} vary independently",
-}
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,12 @@ class PossibleTerm:
     def motion(self) -> str:
         """Motion that separates the term from the parameters."""
         other = self.kind.partition(" of " if " of " in self.kind else " to ")[2]
-        of_prefix = next((x for start, x in _PREFIXES.items() if self.kind.startswith(start)), _RICHER)
+        of_other = {
+            "harmonic ": "a wider range of {other}",
+            "gravity ": "a wider range of {other}",
+            "coupling ": "motion in which {other} and {place} vary independently",
+        }
+        of_prefix = next((x for start, x in of_other.items() if self.kind.startswith(start)), _RICHER)
         _, motion = KINDS.get(self.kind, ("", of_prefix))
         return motion.format(place=self.place, formula=self.formula, other=other)
 
@@ -152,9 +151,9 @@ def check_terms(terms: Sequence[PossibleTerm]) -> None:
         As read from a file.
     """
     figures = [x for one in terms for x in (one.variance, *one.effects.values(), *one.shifts.values())]
-    if not all(abs(x) < _LARGEST for x in figures) or any(x.variance < 0.0 for x in terms):
+    if not all(abs(x) < 1e100 for x in figures) or any(x.variance < 0.0 for x in terms):
         raise ValueError("possible_terms: a coefficient that no term has")
-    if not all(0.0 <= x.weight <= 1.0 for x in terms) or sum(x.weight for x in terms) > 1.0 + _ROUNDING:
+    if not all(0.0 <= x.weight <= 1.0 for x in terms) or sum(x.weight for x in terms) > 1.0 + 1e-9:
         raise ValueError("possible_terms: weights that are no probabilities")
 
 
@@ -206,7 +205,7 @@ def _quantiles(weights: FloatArray, means: FloatArray, deviations: FloatArray, l
     """Quantile ``(n,)`` of each mixture (K, n), by bisection."""
     # Beyond nine standard deviations a normal distribution has nothing, to rounding errors.
     low, high = (means - 9.0 * deviations).min(axis=0), (means + 9.0 * deviations).max(axis=0)
-    for _ in range(_BISECTIONS):
+    for _ in range(60):
         middle = 0.5 * (low + high)
         below = weights @ _normal((middle - means) / deviations) < level
         low, high = np.where(below, middle, low), np.where(below, high, middle)

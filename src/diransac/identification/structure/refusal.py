@@ -17,7 +17,7 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
-from diransac.identification.regression.uncertainty import robust_std
+from diransac.identification.regression.uncertainty import CLEAR, robust_std
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
@@ -28,12 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["cause_of_refusal", "check_known_terms", "check_motion", "check_signs"]
 
-# Lags of serial correlation; its RMS over them above which a signal is a motion: in standard errors, and at least.
-_LAGS, _SIGNIFICANT, _CORRELATED = 5, 3.0, 0.1
-# Fewest rows for it; clipping, in robust standard deviations; variation over the size of a signal that is rounding.
-_FEWEST_ROWS, _CLIP, _ROUNDING = 30, 1.5, 1e-12
-# Ratio of small differences of neighbours to those of distant samples below which a signal moves, and samples for it.
-_NEARER, _ENOUGH_FOR_QUANTILES = 0.5, 150
 _ADVICE = "compare the terms, constants and bounds of the model with the machine"
 
 
@@ -59,9 +53,10 @@ def check_motion(dataset: Dataset) -> None:
 
 
 def _moves(values: FloatArray) -> bool:
-    """True if a signal ``(N,)`` is not constant and has serial correlation, or is too short for a decision.
+    """True if a signal ``(N,)`` is not constant and has serial correlation over five lags, or less than 30 samples.
 
-    Where half of the samples are outliers, their size hides a correlation; the small differences do not.
+    Where half of the samples are outliers, their size hides a correlation; the small differences of neighbours, which
+    are half of those of distant samples at most, do not.
     """
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
@@ -71,19 +66,20 @@ def _moves(values: FloatArray) -> bool:
     known = np.isfinite(values)
     x = np.where(known, values - np.median(values[known]), 0.0) / (np.abs(values[known]).max() + 1e-300)
     size = np.abs(x[known])
-    if size.max() < _ROUNDING:
+    if size.max() < 1e-12:  # a variation by rounding
         return False
-    if known.sum() < _FEWEST_ROWS:
+    if known.sum() < 30:
         return True
-    x = np.clip(x / (robust_std(size) or float(size.mean())), -_CLIP, _CLIP)
-    pairs = [(known[:-k] & known[k:], x[:-k] * x[k:]) for k in range(1, _LAGS + 1)]
+    x = np.clip(x / (robust_std(size) or float(size.mean())), -1.5, 1.5)
+    pairs = [(known[:-k] & known[k:], x[:-k] * x[k:]) for k in range(1, 6)]
     covariances = np.array([both @ product / max(1, both.sum()) for both, product in pairs])
     correlation = np.sqrt(np.mean(np.square(covariances))) / np.mean(np.square(x[known]))
-    if correlation > max(_CORRELATED, _SIGNIFICANT / np.sqrt(known.sum())):
+    # White noise has a correlation of one over the root of the number of samples.
+    if correlation > max(0.1, CLEAR / np.sqrt(known.sum())):
         return True
     good = values[known]
     near, far = (_small_difference(good, apart) for apart in (1, len(good) // 3))
-    return bool(near < _NEARER * far and len(good) > _ENOUGH_FOR_QUANTILES)
+    return bool(near < 0.5 * far and len(good) > 150)
 
 
 def _small_difference(values: FloatArray, apart: int) -> float:

@@ -36,13 +36,8 @@ if TYPE_CHECKING:
 __all__ = ["Ranges", "check_structure", "structural", "structural_slopes", "unidentifiable"]
 
 
-# Parameter vectors at which dr/dp is evaluated; random motions for each, at least and per parameter; the decades below
-# half a range that they cover, and half the range of a signal of which no log shows it.
-_N_VECTORS, _N_MOTIONS, _PER_PARAMETER, _DECADES, _HALF_RANGE = 3, 60, 4, 3.0, 10.0
-
-
-# Random motions of which some signals are measured, their steps per unknown, and a step over the fastest time constant.
-_N_TRAJECTORIES, _STEPS_PER_UNKNOWN, _STEP = 4, 2, 0.2
+# Half the range of a signal of which no log shows it.
+_HALF_RANGE = 10.0
 
 
 # Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades;
@@ -87,7 +82,7 @@ def structural(
     rng = np.random.default_rng(20240607)
     bounds = list(model.parameters.values())
     free = np.flatnonzero([x.lower < x.upper for x in bounds])
-    vectors = [_random_parameters(bounds, rng) for _ in range(_N_VECTORS)]
+    vectors = [_random_parameters(bounds, rng) for _ in range(3)]
 
     def jacobian(p: FloatArray, ranges: Ranges) -> FloatArray:
         if measured is None:
@@ -196,7 +191,7 @@ def _centres(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
 
 def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, ranges: Ranges) -> FloatArray:
     """Rows ``(n, n_p)`` of ``dr/dp`` and ``dy/dp`` at random motions that satisfy the equations, each of unit size."""
-    n = max(_N_MOTIONS, _PER_PARAMETER * model.n_p)
+    n = max(60, 4 * model.n_p)
     middle, half = (x[:, None] for x in _centres(model, ranges))
     sizes = (model.n_q, model.n_v, model.n_u)
     drawn = middle + half * np.concatenate([_random_numbers((size, n), rng) for size in sizes])
@@ -217,21 +212,22 @@ def _output_jacobian(
 ) -> FloatArray:
     """Derivatives ``(n, n_p)`` of measured signals in random motions, without what initial states can explain.
 
-    Motions are sequences of Euler's steps, which have the symmetries of the equations.
+    Four motions are sequences of Euler's steps, which have the symmetries of the equations: two per unknown, each a
+    fifth of the fastest time constant.
     """
     n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
     middle, half = _centres(model, ranges)
     half = half / (1.0 if ranges else _HALF_RANGE)
     rows, blocks = [model.signals.index(n) for n in measured], []
-    for _ in range(_N_TRAJECTORIES):
+    for _ in range(4):
         x, step = middle[:n_x] + half[:n_x] * rng.normal(size=n_x), 0.0
         of_x, of_p, seen_x, seen_p = np.eye(n_x), np.zeros((n_x, model.n_p)), list[FloatArray](), list[FloatArray]()
-        for _ in range(_STEPS_PER_UNKNOWN * (n_x + model.n_p)):
+        for _ in range(2 * (n_x + model.n_p)):
             for four in model.quaternions:
                 x[list(four)] /= np.linalg.norm(x[list(four)])
             u = middle[n_x:] + half[n_x:] * rng.normal(size=model.n_u)
             A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
-            step = step or _STEP / max(1.0, float(np.linalg.norm(A)))
+            step = step or 0.2 / max(1.0, float(np.linalg.norm(A)))
             moved_x, moved_p = A @ of_x, A @ of_p + P
             x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
             C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
@@ -256,8 +252,8 @@ def _sensor_slopes(model: Model) -> ca.Function:
 
 
 def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
-    """Numbers of both signs, up to 1 and of several magnitudes: a saturation is neither always on nor never."""
-    return np.asarray(rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(-_DECADES, 0.0, shape))
+    """Numbers of both signs, up to 1 and over three decades: a saturation is neither always on nor never."""
+    return np.asarray(rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(-3.0, 0.0, shape))
 
 
 def _null_space(J: FloatArray, rank: float) -> NullSpace:
