@@ -291,21 +291,24 @@ def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, s
     (counter-based random numbers).
     """
     half = max(1, -(-(n_rows - 1).bit_length() // 2))
-    shift, low = np.uint64(half), np.uint64(2**half - 1)
     of_sample = _mixed(_mixed(np.array([int(seed) % 2**64], np.uint64)) + np.asarray(iterations, np.uint64))
     # Six rounds pass a chi-square test of pairs of positions from 30 rows on; fewer rows need twelve.
     rounds = np.arange(1, 7 if half > 3 else 13, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     keys = _mixed(of_sample + rounds[:, None])
-    found = np.tile(np.arange(start, stop, dtype=np.uint64), (len(of_sample), 1))
-    sample, place = np.nonzero(np.ones(found.shape, bool))
-    while len(sample):  # numbers that the network takes out of the range are permuted again
-        left, right = found[sample, place] >> shift, found[sample, place] & low
-        for key in keys:
-            left, right = right, left ^ (_mixed(right + key[sample]) & low)
-        found[sample, place] = left << shift | right
-        outside = found[sample, place] >= n_rows
-        sample, place = sample[outside], place[outside]
+    positions = np.tile(np.arange(start, stop, dtype=np.uint64), (len(of_sample), 1))
+    found = _permuted(positions, keys[:, :, None], half)
+    while (outside := found >= n_rows).any():  # until the network takes all of them into the range
+        found[outside] = _permuted(found[outside], keys[:, np.nonzero(outside)[0]], half)
     return found.astype(np.int64)
+
+
+def _permuted(x: npt.NDArray[np.uint64], keys: npt.NDArray[np.uint64], half: int) -> npt.NDArray[np.uint64]:
+    """A Feistel network: numbers of ``2 half`` bits, permuted by the keys of its rounds."""
+    shift, low = np.uint64(half), np.uint64(2**half - 1)
+    left, right = x >> shift, x & low
+    for key in keys:
+        left, right = right, left ^ (_mixed(right + key) & low)
+    return left << shift | right
 
 
 def _mixed(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
