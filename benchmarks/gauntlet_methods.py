@@ -17,7 +17,7 @@ from sklearn.linear_model import HuberRegressor, LinearRegression, RANSACRegress
 
 import diransac as dr
 from diransac.data.dataset import Dataset, bind_log
-from diransac.identification.estimators import regression
+from diransac.identification.regression.rows import regression
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 Array = np.ndarray[Any, Any]

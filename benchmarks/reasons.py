@@ -22,7 +22,7 @@ from regime_flights import REGIMES, Recording, recordings, rk4
 from regime_machines import Array
 
 import diransac as dr
-from diransac.identification.findings import shown
+from diransac.identification.finding import shown
 
 DEGREE, MILLI, G = np.pi / 180.0, 1e-3, 9.81
 UNRELIABLE = "do not rely on this"

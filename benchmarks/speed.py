@@ -24,8 +24,8 @@ from kernel import QUADROTOR, REPETITIONS, CLoops, medians, problem_of, quadroto
 
 import diransac as dr
 from diransac.data.dataset import Dataset, bind_log
-from diransac.identification.estimators import regression
-from diransac.identification.sampling import sample_rows
+from diransac.identification.methods.samples import sample_rows
+from diransac.identification.regression.rows import regression
 from diransac.simulation import LinearFeedback, RolloutBatch, rollouts
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))

@@ -6,7 +6,7 @@ import pytest
 
 import diransac as dr
 import machines
-from diransac.identification.identifiability import structural
+from diransac.identification.structure.structural import structural
 from machines import MACHINES, recorded
 
 

@@ -84,7 +84,8 @@ def end_of(command):
 libraries = {"scipy", "polars", "pydantic", "rich"}
 unused = {f"diransac.{part}" for part in ("data.mapping", "export", "model.robots", "report")}
 others = {f"diransac.{part}" for part in ("cli.commands.stores", "cli.commands.results", "flight", "study")}
-rare = {f"diransac.identification.{part}" for part in ("driven_states", "nonlinear", "validation")}
+rare = {"regression.observers", "regression.nonlinear", "assessment.validation"}
+rare = {f"diransac.identification.{part}" for part in rare}
 show(libraries | unused | {"diransac.flight.planning", "diransac.identification.methods.lo_diransac", "diransac.study"})
 end_of(main)
 show(libraries | unused | others | rare)

@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.data import preprocessing as prepare
-from diransac.identification.inspection import inspect
+from diransac.identification.assessment.inspection import inspect
 from results import assert_needs_no_care_but_for_terms
 from user_models import tumbling
 

@@ -8,7 +8,7 @@ import pytest
 import diransac as dr
 from diransac.data.dataset import Dataset, bind_log
 from diransac.errors import LogError, SettingsError
-from diransac.identification.estimators import regression
+from diransac.identification.regression.rows import regression
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 from user_models import tumbling

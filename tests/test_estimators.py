@@ -21,7 +21,8 @@ from sklearn.svm import LinearSVR
 import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, SettingsError
-from diransac.identification.estimators import as_estimator, solve_definite
+from diransac.identification.regression.estimators import solve_definite
+from diransac.identification.regression.scikit_learn import as_estimator
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 

@@ -18,11 +18,11 @@ import diransac as dr
 from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
 from diransac.errors import TimeLimitError
+from diransac.identification.assessment.inspection import inspect
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.identifiability import structural
-from diransac.identification.inspection import inspect
-from diransac.identification.multistart import least_squares
-from diransac.identification.observers import Observers
+from diransac.identification.regression.multistart import least_squares
+from diransac.identification.regression.observers import Observers
+from diransac.identification.structure.structural import structural
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
 from results import assert_needs_no_care_but_for_terms

@@ -9,7 +9,8 @@ import pytest
 import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError
-from diransac.identification.identifiability import collinear, structural
+from diransac.identification.structure.identifiability import collinear
+from diransac.identification.structure.structural import structural
 from diransac.model.library import BUILTIN, builtin
 from user_models import hanging_mass, tumbling
 

@@ -12,7 +12,7 @@ import diransac as dr
 from command_line import run
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import SettingsError
-from diransac.identification.estimate import Resolution
+from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts

@@ -9,10 +9,10 @@ import pytest
 import diransac as dr
 from command_line import run
 from diransac.data.dataset import Dataset
-from diransac.identification.estimators import OrdinaryLeastSquares
 from diransac.identification.methods import METHODS, WITH_ESTIMATOR
 from diransac.identification.methods.least_squares import bound_to, fitted
-from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.regression.estimators import OrdinaryLeastSquares
+from diransac.identification.regression.nonlinear import NonlinearLeastSquares
 from user_models import tumbling
 
 MASS, DRAG, GAIN, DT = 0.25, 0.4, 1.7, 0.02

@@ -18,7 +18,7 @@ from diransac.data.readers.repair import REPAIRS, Repairs
 from diransac.data.readers.topics import table_of_topics
 from diransac.data.suggested_mapping import suggest_mapping
 from diransac.errors import LogError, SettingsError
-from diransac.identification.inspection import inspect
+from diransac.identification.assessment.inspection import inspect
 
 T = np.arange(300) / 100.0
 RNG = np.random.default_rng(8)

@@ -6,8 +6,8 @@ import pytest
 import diransac as dr
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset
-from diransac.identification.evaluation import Simulation
-from diransac.identification.inspection import inspect
+from diransac.identification.assessment.inspection import inspect
+from diransac.identification.evaluation.simulation import Simulation
 from simulated import MACHINES, flight
 
 PLANE = MACHINES["planar-rotorcraft"]

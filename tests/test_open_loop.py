@@ -7,7 +7,7 @@ import diransac as dr
 from command_line import run
 from diransac.data.input_timing import InputTiming
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.identification.estimate import Resolution
+from diransac.identification.diagnosis import Resolution
 from results import changed
 from simulated import MACHINES, as_log, flight
 

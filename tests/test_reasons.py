@@ -9,9 +9,9 @@ from regime_flights import REGIMES, recordings
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.columns import contradictions, mistakes_of_columns
-from diransac.identification.motion_rows import motion_rows, solved
-from diransac.identification.nonlinear import solved_nonlinear
+from diransac.identification.regression.nonlinear import solved_nonlinear
+from diransac.identification.regression.rows import motion_rows, solved
+from diransac.identification.structure.columns import contradictions, mistakes_of_columns
 from simulated import MACHINES, as_log, flight
 
 SEED = 2000

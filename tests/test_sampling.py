@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from diransac.identification.sampling import sample_rows
+from diransac.identification.methods.samples import sample_rows
 
 SEEDS = st.integers(-(2**70), 2**70)
 SIZES = st.integers(1, 300)

@@ -14,11 +14,16 @@ from hypothesis import strategies as st
 from algorithm1 import Choices, Problem, Story, algorithm1
 from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError
-from diransac.identification.estimators import OrdinaryLeastSquares
-from diransac.identification.evaluation import choose_scoring, judged_signals, mean_squared_error, rms_error
+from diransac.identification.evaluation.scoring import (
+    choose_scoring,
+    judged_signals,
+    mean_squared_error,
+    rms_error,
+)
 from diransac.identification.method import Progress
 from diransac.identification.methods.ransac import Diransac, IDiransac, SearchState, search
 from diransac.identification.methods.samples import Evaluator, Samples, Score, ScoredBatch
+from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.settings import Settings
 from diransac.model.library import builtin
 from diransac.simulation import RolloutBatch, rollouts

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import diransac as dr
 from diransac.data.dataset import Dataset, ParameterLayout
-from diransac.identification.driven_states import DrivenStates
-from diransac.identification.inspection import inspect
-from diransac.identification.suggestions import Suggestion, with_terms
+from diransac.identification.assessment.inspection import inspect
+from diransac.identification.regression.observers import DrivenStates
+from diransac.identification.structure.lacking_terms import Suggestion, with_terms
 from diransac.model import expressions
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 from instruments import INSTRUMENTS, TRUTH, flight, recorded

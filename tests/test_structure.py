@@ -8,9 +8,9 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.candidate_terms import candidate_terms
 from diransac.identification.methods.lo_diransac.structural import CandidateTests, weighted
-from diransac.identification.structure import PossibleTerm, mixture_intervals
+from diransac.identification.structure.candidate_terms import candidate_terms
+from diransac.identification.structure.lacking_terms import PossibleTerm, mixture_intervals
 
 # ---------------------------------------------------------------------- the mixture, by brute force
 

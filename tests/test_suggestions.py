@@ -9,9 +9,9 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.candidate_terms import candidate_terms
-from diransac.identification.suggestions import with_terms
-from diransac.identification.term_selection import (
+from diransac.identification.structure.candidate_terms import candidate_terms
+from diransac.identification.structure.lacking_terms import with_terms
+from diransac.identification.structure.term_selection import (
     MeanForces,
     SelectedTerm,
     changes_beside,

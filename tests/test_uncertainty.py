@@ -10,7 +10,12 @@ from scipy.stats import t as student
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance, student_quantile, students_draws
+from diransac.identification.regression.uncertainty import (
+    N_BLOCKS,
+    jackknife_covariance,
+    student_quantile,
+    students_draws,
+)
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight
 

@@ -10,10 +10,10 @@ import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.data.input_timing import InputTiming
 from diransac.errors import LogError, SettingsError
-from diransac.identification.estimate import Resolution
-from diransac.identification.horizons import OpenLoop
-from diransac.identification.inverse_dynamics import force_errors
-from diransac.identification.window_starts import window_starts
+from diransac.identification.assessment.horizons import OpenLoop
+from diransac.identification.assessment.inverse_dynamics import force_errors
+from diransac.identification.assessment.window_starts import window_starts
+from diransac.identification.diagnosis import Resolution
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, rollout
 

@@ -14,9 +14,8 @@ import pytest
 
 import diransac as dr
 from command_line import MODEL, run, run_both, working_folder
-from diransac.identification.estimate import Finding
-from diransac.identification.findings import by_seriousness, next_line, shown, shown_lines, verdict_of
-from diransac.identification.prediction import unexplained
+from diransac.identification.evaluation.prediction import unexplained
+from diransac.identification.finding import Finding, by_seriousness, next_line, shown, shown_lines, verdict_of
 from diransac.report.runs import simulate_on
 from results import changed
 

@@ -51,20 +51,21 @@ if TYPE_CHECKING:
     )
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller, tvlqr, tvlqr_batch
-    from diransac.identification.cross_validation import CrossValidation, cross_validate
-    from diransac.identification.estimate import Finding
-    from diransac.identification.estimators import OrdinaryLeastSquares, ScikitLearnEstimator, TotalLeastSquares
+    from diransac.identification.assessment.cross_validation import CrossValidation, cross_validate
+    from diransac.identification.assessment.open_loop import simulate
+    from diransac.identification.assessment.validation import Validation, validate
+    from diransac.identification.finding import Finding
     from diransac.identification.identify import METHODS, identify
     from diransac.identification.method import Progress
     from diransac.identification.methods.least_squares import LeastSquares
     from diransac.identification.methods.lo_diransac import LoDiransac
     from diransac.identification.methods.ransac import Diransac, IDiransac
-    from diransac.identification.nonlinear import NonlinearLeastSquares
-    from diransac.identification.open_loop import simulate
+    from diransac.identification.regression.estimators import OrdinaryLeastSquares, TotalLeastSquares
+    from diransac.identification.regression.nonlinear import NonlinearLeastSquares
+    from diransac.identification.regression.scikit_learn import ScikitLearnEstimator
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
-    from diransac.identification.suggestions import Suggestion
-    from diransac.identification.validation import Validation, validate
+    from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
     from diransac.plots import plot_flight
     from diransac.report import write_report
@@ -177,20 +178,21 @@ _FOUND_IN = {
     ),
     "flight.trajectory": ("Trajectory",),
     "flight.tvlqr": ("Controller", "tvlqr", "tvlqr_batch"),
-    "identification.estimate": ("Finding",),
-    "identification.estimators": ("OrdinaryLeastSquares", "ScikitLearnEstimator", "TotalLeastSquares"),
+    "identification.finding": ("Finding",),
+    "identification.regression.estimators": ("OrdinaryLeastSquares", "TotalLeastSquares"),
+    "identification.regression.scikit_learn": ("ScikitLearnEstimator",),
     "identification.identify": ("METHODS", "identify"),
     "identification.method": ("Progress",),
     "identification.methods.least_squares": ("LeastSquares",),
     "identification.methods.lo_diransac": ("LoDiransac",),
     "identification.methods.ransac": ("Diransac", "IDiransac"),
-    "identification.nonlinear": ("NonlinearLeastSquares",),
-    "identification.open_loop": ("simulate",),
+    "identification.regression.nonlinear": ("NonlinearLeastSquares",),
+    "identification.assessment.open_loop": ("simulate",),
     "identification.result": ("Result",),
     "identification.settings": ("Settings",),
-    "identification.suggestions": ("Suggestion",),
-    "identification.cross_validation": ("CrossValidation", "cross_validate"),
-    "identification.validation": ("Validation", "validate"),
+    "identification.structure.lacking_terms": ("Suggestion",),
+    "identification.assessment.cross_validation": ("CrossValidation", "cross_validate"),
+    "identification.assessment.validation": ("Validation", "validate"),
     "model.robots": ("JointTorques", "MotorCurrents", "PositionControl"),
     "plots": ("plot_flight",),
     "report": ("write_report",),

@@ -11,7 +11,7 @@ from typing import Any
 from diransac.cli.screen import bar
 from diransac.data.log import Log
 from diransac.errors import DiransacError
-from diransac.identification.findings import shown_lines
+from diransac.identification.finding import shown_lines
 from diransac.identification.identify import identify
 from diransac.identification.method import Method
 from diransac.identification.result import Result

@@ -1,289 +1,37 @@
-"""`Estimate`: parameters, covariance and diagnosis that a method returns; `Evaluation`: its simulation's agreement.
-
-`Finding` is a sentence for or against a result, with its level.
-"""
+"""`Estimate`: parameters and covariance that a method returns, with its comparisons; `Evaluation`: its agreement."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from types import MappingProxyType
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data.input_timing import InputTiming
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.diagnosis import Diagnosis, Resolution
+from diransac.identification.finding import Finding
 from diransac.identification.serialization import (
     Mask,
-    Masks,
     Number,
     Numbers,
-    Series,
     Values,
-    WholeNumbers,
 )
-from diransac.identification.structure import PossibleTerm
-from diransac.identification.suggestions import Suggestion
+from diransac.identification.structure.lacking_terms import PossibleTerm, Suggestion
 
 __all__ = [
     "TIME_LIMIT",
     "Competition",
     "Competitor",
-    "Diagnosis",
     "Estimate",
     "Evaluation",
-    "Finding",
-    "Level",
     "LogEstimate",
     "LogSummary",
     "Prediction",
-    "Resolution",
 ]
 
-_LARGEST, _PREDICTS = 1e150, 0.5
-"""Bound of figures of windows; their squares are finite."""
 
 TIME_LIMIT = "time limit reached"
 """Stop reason of a search that a limit on its time ended."""
-
-Level = Literal["note", "good", "care", "bad"]
-"""Levels of findings, the least serious first."""
-
-
-class Finding(str):
-    """A sentence for or against a result: a string with a level and an action.
-
-    Parameters
-    ----------
-    level : {"note", "good", "care", "bad"}
-        ``good`` supports the result, ``care`` and ``bad`` oppose it, a ``note`` is neutral.
-    claim : str
-        What was found: a sentence, without a stop where an action follows.
-    action : str, optional
-        What to do about it, in the imperative; the sentence ends with it.
-
-    Raises
-    ------
-    ValueError
-        There is no such level.
-    """
-
-    level: Level
-    action: str
-
-    def __new__(cls, level: Level, claim: str, action: str = "") -> Finding:
-        """A finding of a level."""
-        if level not in get_args(Level):
-            raise ValueError(f"level {level!r} of a finding; there are {', '.join(get_args(Level))}")
-        made = super().__new__(cls, f"{claim}; {action}." if action else claim)
-        made.level, made.action = level, action
-        return made
-
-    @property
-    def claim(self) -> str:
-        """The sentence without the action."""
-        return self.removesuffix(f"; {self.action}.") if self.action else str(self)
-
-    def __getnewargs__(self) -> tuple[Level, str, str]:  # type: ignore[override]  # a string's are its text alone
-        return self.level, self.claim, self.action
-
-    def __repr__(self) -> str:
-        return f"Finding({self.level!r}, {self.claim!r}, {self.action!r})"
-
-    @property
-    def seriousness(self) -> int:
-        """Place of the level among the levels: 0 for a note, 3 for bad."""
-        return get_args(Level).index(self.level)
-
-    def to_dict(self) -> dict[str, str]:
-        """Form in JSON: level, the whole sentence, and the action at its end."""
-        return {"level": self.level, "text": str(self), "action": self.action}
-
-    @classmethod
-    def _from_dict(cls, data: Mapping[str, Any]) -> Finding:
-        """The finding of `to_dict`; those of earlier versions have no action."""
-        action = data.get("action", "")
-        return cls(data["level"], data["text"].removesuffix(f"; {action}.") if action else data["text"], action)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, _source: object, _handler: object) -> Any:
-        """Form in JSON: that of `to_dict`."""
-        from pydantic_core import core_schema
-
-        text = core_schema.str_schema(strict=True)
-        fields = {
-            "level": core_schema.typed_dict_field(core_schema.literal_schema(list(get_args(Level)))),
-            "text": core_schema.typed_dict_field(text),
-            "action": core_schema.typed_dict_field(text, required=False),
-        }
-        return core_schema.no_info_after_validator_function(
-            cls._from_dict,
-            core_schema.typed_dict_schema(fields),
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda found: found.to_dict()),
-        )
-
-
-@dataclass(frozen=True)
-class Resolution:
-    """Integration and inputs of a simulation.
-
-    Parameters
-    ----------
-    integrator : str, optional
-        "rk4", "euler" or "semi-implicit-euler".
-    substeps : int, optional
-        Integration steps per sample.
-    hold : str, optional
-        Inputs between samples: "zero-order", held; "linear" or "smooth", interpolated.
-    timing : InputTiming, optional
-        Delay and lag after which recorded inputs act.
-    """
-
-    integrator: str = "rk4"
-    substeps: int = 1
-    hold: str = "zero-order"
-    timing: InputTiming = field(default_factory=InputTiming)
-
-    @property
-    def interpolation(self) -> str:
-        """Interpolation of the inputs, in words; empty where they are held."""
-        how = {"linear": "linearly", "smooth": "smoothly"}.get(self.hold)
-        return f"inputs interpolated {how}" if how else ""
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """Sensor noise, outliers, unmodelled forces and input delay, as lo-diransac separates them.
-
-    Samples are the rows of the logs as they were given, log after log.  Windows are the W intervals over which
-    unmodelled accelerations are constant.
-
-    Parameters
-    ----------
-    noise_std : mapping of str to float
-        Standard deviation of the Gaussian noise of each measured signal, its unit.
-    outlier_fraction : mapping of str to float
-        Fraction of the samples of each signal that are outliers.
-    outliers : mapping of str to (N,) bool array
-        Samples of each signal that are outliers with a probability above one half.
-    window_log : (W,) int array
-        Index of the log of each window.
-    unmodelled_time : (W,) array
-        Middle of each window in the time of its log, s.
-    unmodelled_accelerations : mapping of str to (W,) array
-        Part of each acceleration that the model does not explain, its unit.
-    unmodelled_forces : mapping of str to (W,) array
-        The generalised force of each, N where the coordinate is in m, N m where it is in rad; empty where the model's
-        equations are not a balance of forces.
-    smoothed_time : (W,) array
-        First row of each window, s.
-    smoothed_states : mapping of str to (W,) array
-        Most probable value of each state at those times, measured or not.
-    input_delay, input_delay_error : float
-        Delay of the inputs with respect to the log, lag included, and its standard error, s.
-    input_delay_significant : bool
-        Whether the delay exceeds three standard errors and a quarter of a sample.
-    unidentifiable : tuple of str
-        Names of the parameters that the logs do not determine.
-    combinations : tuple of str, optional
-        Sentences about these parameters: the combinations that are determined, the reason, the remedy.
-    suggested_terms : mapping of str to (W,) array, optional
-        What suggested terms explain of each unmodelled force, or of each acceleration where there are no forces, beside
-        the parameters that would change with them; empty without suggestions.
-    """
-
-    noise_std: Values
-    outlier_fraction: Values
-    outliers: Masks
-    window_log: WholeNumbers
-    unmodelled_time: Numbers
-    unmodelled_accelerations: Series
-    unmodelled_forces: Series
-    smoothed_time: Numbers
-    smoothed_states: Series
-    input_delay: Number
-    input_delay_error: Number
-    input_delay_significant: bool
-    unidentifiable: tuple[str, ...]
-    combinations: tuple[str, ...] = ()
-    suggested_terms: Series = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        series = [self.window_log, self.unmodelled_time, self.smoothed_time]
-        for name in (
-            "noise_std",
-            "outlier_fraction",
-            "outliers",
-            "unmodelled_accelerations",
-            "unmodelled_forces",
-            "suggested_terms",
-            "smoothed_states",
-        ):
-            values = dict(getattr(self, name))
-            series += [x for x in values.values() if isinstance(x, np.ndarray)]
-            object.__setattr__(self, name, MappingProxyType(values))
-        for array in series:
-            array.setflags(write=False)
-
-    def check_windows(self) -> None:
-        """Raise ValueError: the figures of windows are not as many as these, or squares of them overflow."""
-        named = (self.unmodelled_accelerations, self.unmodelled_forces, self.suggested_terms, self.smoothed_states)
-        figures = (self.unmodelled_time, self.smoothed_time, *(x for values in named for x in values.values()))
-        if any(len(x) != len(self.window_log) for x in figures):
-            raise ValueError(f"figures of other than {len(self.window_log)} windows")
-        if not all((np.abs(x) < _LARGEST).all() for x in figures):
-            raise ValueError("figures of windows that no machine has")
-
-    def windows_of(self, log: int) -> IntArray:
-        """Indices of the windows of one log."""
-        return np.flatnonzero(self.window_log == log)
-
-    def of_log(self, log: int, rows: slice) -> Diagnosis:
-        """The diagnosis of one log alone, whose rows among those of all logs are given."""
-        windows = self.windows_of(log)
-        return replace(
-            self,
-            outliers={name: mask[rows] for name, mask in self.outliers.items()},
-            window_log=np.zeros_like(windows),
-            unmodelled_time=self.unmodelled_time[windows],
-            unmodelled_accelerations={n: x[windows] for n, x in self.unmodelled_accelerations.items()},
-            unmodelled_forces={n: x[windows] for n, x in self.unmodelled_forces.items()},
-            suggested_terms={n: x[windows] for n, x in self.suggested_terms.items()},
-            smoothed_time=self.smoothed_time[windows],
-            smoothed_states={n: x[windows] for n, x in self.smoothed_states.items()},
-        )
-
-    def first_states(self, log: int) -> dict[str, float]:
-        """Most probable state at the first row of one log, by name."""
-        first = self.windows_of(log)[0]
-        return {name: float(values[first]) for name, values in self.smoothed_states.items()}
-
-    def unidentifiable_sentences(self) -> tuple[str, ...]:
-        """Sentences about the parameters that are not identifiable, without stops; empty where there is none."""
-        each = (f"{name} is not identifiable from this log; excite it" for name in self.unidentifiable)
-        return self.combinations or tuple(each)
-
-    def lines(self, units: Mapping[str, str]) -> list[list[str]]:
-        """Rows of a table: signal, noise, outliers, and the RMS that the model does not explain.
-
-        Parameters
-        ----------
-        units : mapping of str to str
-            Unit of each signal.
-
-        Returns
-        -------
-        list of list of str
-        """
-        rows = [["signal", "noise", "outliers", "unexplained", "unit"]]
-        for name in dict.fromkeys((*self.noise_std, *self.unmodelled_accelerations)):
-            measured, latent = name in self.noise_std, self.unmodelled_accelerations.get(name)
-            noise = f"{self.noise_std[name]:.2g}" if measured else ""
-            fraction = f"{100.0 * self.outlier_fraction[name]:.1f} %" if measured else ""
-            unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
-            rows.append([name, noise, fraction, unexplained, units[name]])
-        return rows
 
 
 @dataclass(frozen=True)
@@ -338,7 +86,7 @@ class Competition:
     @property
     def predicts(self) -> bool:
         """True if the winner predicts much better than that nothing changes, at one horizon at least."""
-        return min(next(x for x in self.competitors if x.name == self.winner).errors) < _PREDICTS
+        return min(next(x for x in self.competitors if x.name == self.winner).errors) < 0.5
 
     def lines(self) -> list[list[str]]:
         """Rows of a table: the best variant of each source, its errors at each horizon, and whether it is as good."""
@@ -449,7 +197,7 @@ class Estimate:
     n_hypotheses: int = 1
     stop_reason: str = "whole log fitted"
     rejected: Mapping[str, int] = field(default_factory=dict)
-    resolution: Resolution = Resolution()
+    resolution: Resolution = field(default_factory=Resolution)
     squared_error: bool = False
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None

@@ -13,26 +13,24 @@ from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
-from diransac.identification.agreement import disagreements
-from diransac.identification.columns import Mistake, contradictions, mistakes_of_columns
-from diransac.identification.estimate import Estimate, Evaluation, Finding, LogSummary, Prediction
-from diransac.identification.evaluation import choose_scoring, evaluate, judged_signals
-from diransac.identification.known_parameters import KnownParameters
+from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Prediction
+from diransac.identification.evaluation.agreement import disagreements
+from diransac.identification.evaluation.prediction import predictions
+from diransac.identification.evaluation.scoring import choose_scoring, evaluate, judged_signals
+from diransac.identification.finding import Finding
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
-from diransac.identification.prediction import predictions
-from diransac.identification.refusal import check_motion
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
-from diransac.identification.suggestions import with_terms
+from diransac.identification.structure.columns import Mistake, contradictions, mistakes_of_columns
+from diransac.identification.structure.known_parameters import KnownParameters
+from diransac.identification.structure.lacking_terms import with_terms
+from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
 __all__ = ["METHODS", "Identification", "checked_hold", "identify", "method_object"]
-
-_DOUBTFUL = 0.25
-"""Part of an acceleration that is unexplained from which on mistakes of columns are sought."""
 
 
 def identify(
@@ -377,7 +375,7 @@ class _Task:
 
 def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
     """Mistakes of columns that explain the logs, and the number of those tested."""
-    from diransac.identification.nonlinear import solved_nonlinear
+    from diransac.identification.regression.nonlinear import solved_nonlinear
 
     with np.errstate(all="ignore"):  # a correction that overflows explains nothing
         return mistakes_of_columns(dataset, solved_nonlinear)
@@ -405,7 +403,8 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     is_bad, n_tested = result.verdict == "do not rely on this", 0
     parameters = result.model.parameters
     lost = [n for n, (low, high) in result.intervals().items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
-    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > _DOUBTFUL
+    # A quarter of an acceleration that is unexplained is a reason to test columns.
+    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25
     if is_doubtful:
         mistakes, n_tested = _mistakes(dataset)
     else:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from diransac.errors import IdentificationError
-from diransac.identification.identifiability import structural
-from diransac.identification.motion_rows import motion_rows
-from diransac.identification.refusal import cause_of_refusal
+from diransac.identification.regression.rows import motion_rows
+from diransac.identification.structure.refusal import cause_of_refusal
+from diransac.identification.structure.structural import structural
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset

@@ -6,125 +6,36 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
-from diransac.identification.estimate import (
-    Competition,
-    Diagnosis,
-    Estimate,
-    Evaluation,
-    Finding,
-    LogSummary,
-    Resolution,
-)
-from diransac.identification.findings import Verdict, findings_of, next_line, shown_lines, verdict_of
-from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
+from diransac.identification import result_files
+from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import Competition, Estimate, Evaluation, LogSummary
+from diransac.identification.evaluation.findings import findings_of
+from diransac.identification.finding import Finding, Verdict, verdict_of
+from diransac.identification.regression.uncertainty import student_quantile, students_draws
+from diransac.identification.result_text import html_of, text_of
 from diransac.identification.settings import Settings
-from diransac.identification.structure import StructuralUncertainty, check_terms, largest, mixture_intervals
-from diransac.identification.suggestions import Suggestion
-from diransac.identification.uncertainty import student_quantile, students_draws
+from diransac.identification.structure.lacking_terms import (
+    StructuralUncertainty,
+    Suggestion,
+    largest,
+    mixture_intervals,
+)
 from diransac.model import Model
 from diransac.plain_data import json_data, read_text
-from diransac.simulation import HOLDS
-from diransac.text_table import aligned, telling_digits
 
 if TYPE_CHECKING:
-    from diransac.export import PortableModel
-    from diransac.identification.structure import PossibleTerm
+    from diransac.identification.structure.lacking_terms import PossibleTerm
 
 __all__ = ["Result"]
-
-_FORMAT = 10
-_SINCE: Mapping[int, Mapping[str, object]] = {9: {"mistakes": (), "n_columns_tested": 0}}
-"""Formats that are read besides, with the values of what they lack."""
-_LATEST = 1e9
-"""Bound of delays and lags, s, and of the drift of gains."""
-_BY_LOG = ("parameters", "covariance")
-"""Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
-_ROUNDING = 1e-3
-"""Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
-_N_EXPORTED = 1000
-"""Draws of the parameters in a YAML file."""
-
-
-def _check_resolution(resolution: Resolution, n_u: int) -> None:
-    """Raise ValueError: the inputs of a simulation have no such hold or timing."""
-    timing = resolution.timing
-    of_inputs = (timing.own_delays, timing.own_lags, timing.gain_drifts)
-    if resolution.hold not in HOLDS:
-        raise ValueError(f"hold {resolution.hold}")
-    if any(len(x) not in (0, n_u) for x in of_inputs):
-        raise ValueError(f"timing of other than {n_u} inputs")
-    if not all(abs(x) < _LATEST for x in chain((timing.delay, timing.lag), *of_inputs)):
-        raise ValueError("timing: it is that of no machine")
-
-
-def _is_covariance(covariance: FloatArray) -> bool:
-    """True if variances are not negative, and the correlations of those that are finite are symmetric and definite."""
-    variances = np.diag(covariance)
-    if (variances < 0.0).any():
-        return False
-    known = np.isfinite(variances) & (variances > 0.0)
-    deviations = np.sqrt(variances[known])
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        correlation = covariance[np.ix_(known, known)] / deviations[:, None] / deviations
-    if not np.isfinite(correlation).all() or np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
-        return False
-    return bool(np.linalg.eigvalsh(correlation).min(initial=0.0) >= -_ROUNDING)
-
-
-def _write(path: str | Path, text: str) -> None:
-    """Write a file, atomically.  Raises ResultError: it cannot be written."""
-    try:
-        write_text(path, text)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-@dataclass(frozen=True)
-class _Provenance:
-    """Provenance of a result in its JSON."""
-
-    method: str
-    seed: int
-    logs: tuple[LogSummary, ...]
-    notes: tuple[str, ...]
-    options: Mapping[str, Any]
-    bandwidth_sensitivity: NumberPairs | None
-    fixed: tuple[str, ...]
-    priors: NumberPairs
-
-
-@dataclass(frozen=True)
-class _Public:
-    """Parameters of a result's JSON where some are per log: one value each, and the values of every log."""
-
-    parameters: Values
-    covariance: Numbers
-    per_log: Series
-
-
-@dataclass(frozen=True)
-class _Derived:
-    """Derived figures in a result's JSON, for programs that read it."""
-
-    units: Mapping[str, str]
-    standard_errors: Values
-    intervals_95: NumberPairs
-    structural_intervals_95: NumberPairs | None
-    structure: Mapping[str, StructuralUncertainty] | None
-    violations: tuple[str, ...]
-    verdict: Verdict
-    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +86,6 @@ class Result:
     fixed: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    # ------------------------------------------------------------------ parameters
-
     @cached_property
     def layout(self) -> ParameterLayout:
         """Places of each log's parameters in the estimate."""
@@ -202,13 +111,7 @@ class Result:
         return {**self.parameters, **{name: values[index] for name, values in self.per_log.items()}}
 
     def index_of(self, log: Log) -> int | None:
-        """Index of a log among those identified from; None if it is not one of them.
-
-        Raises
-        ------
-        SettingsError
-            What is given is no log.
-        """
+        """Index of a log among those identified from, or None.  Raises SettingsError: what is given is no log."""
         if not isinstance(log, Log):
             raise SettingsError(f"log is {log!r}; give a dr.Log (result.per_log has the parameters by index)")
         known = [(one.fingerprint, one.prepared_fingerprint) for one in self.logs]
@@ -425,53 +328,7 @@ class Result:
         ResultError
             The file cannot be written.
         """
-        from diransac.export import format_of, write_model
-
-        chosen = format_of(path, to)
-        if chosen in ("mjcf", "urdf"):
-            if into is None:
-                raise SettingsError(f"{chosen} is a robot's description with the estimates in it; give it, as into=")
-            return self._export_description(path, into)
-        if into is not None:
-            raise SettingsError(f'"{into}" has no use: only mjcf and urdf are written into a description')
-        try:
-            write_model(self._portable(name), path, chosen)
-        except OSError as error:
-            raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
-        return ()
-
-    def _export_description(self, path: str | Path, into: str | Path) -> tuple[str, ...]:
-        """Write a description; return the parameters that are not in it."""
-        from diransac.model.robots.calibration import calibrated
-
-        found = self.parameters.items()
-        values = np.array([np.nan if name in self.unidentifiable else x for name, x in found])
-        text, left_out = calibrated(into, self.model.parameters, values, self.covariance)
-        _write(path, text)
-        return left_out
-
-    def _portable(self, name: str | None = None) -> PortableModel:
-        """The model as it is exported; without draws where a parameter has no finite variance."""
-        from diransac.export import PortableModel
-
-        try:
-            samples = self.sample(_N_EXPORTED)
-        except ResultError:
-            samples = {}
-        resolution = self.estimate.resolution
-        return PortableModel(
-            self.model,
-            self.parameters,
-            self.standard_errors,
-            self.covariance,
-            samples,
-            resolution.timing,
-            resolution.hold,
-            {} if self.layout.is_shared else self.per_log,
-            name or "",
-            self.intervals(),
-            self.structural_intervals() if self.has_structure else {},
-        )
+        return result_files.export(self, path, into, to, name)
 
     @property
     def violations(self) -> tuple[str, ...]:
@@ -498,8 +355,6 @@ class Result:
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
         return {n: x.unit for n, x in self.model.parameters.items()}
-
-    # ------------------------------------------------------------------ estimate and evaluation by their names
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -548,6 +403,11 @@ class Result:
         return self.estimate.diagnosis
 
     @property
+    def separates_forces(self) -> bool:
+        """True if the method separates unmodelled forces from noise; a simulation of a whole log adds them up."""
+        return self.diagnosis is not None
+
+    @property
     def suggestions(self) -> tuple[Suggestion, ...]:
         """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
         return self.estimate.suggestions
@@ -572,8 +432,6 @@ class Result:
         """Inliers ``(N,)`` among the rows of the given logs, log after log."""
         return self.evaluation.inliers
 
-    # ------------------------------------------------------------------ logs
-
     def log_rows(self, i: int) -> slice:
         """Rows of log ``i`` among the rows of all logs."""
         begin = sum(log.n_rows for log in self.logs[:i])
@@ -585,133 +443,27 @@ class Result:
         parts = [log.start + log.dt * np.flatnonzero(self.inliers[self.log_rows(i)]) for i, log in enumerate(self.logs)]
         return np.concatenate(parts)
 
-    # ------------------------------------------------------------------ files
-
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; `from_dict` reads it back."""
-        estimate = dump(self.estimate)
-        if not self.layout.is_shared:
-            full = {f"{key}_of_logs": estimate[key] for key in _BY_LOG}
-            estimate |= full | dump(
-                _Public(self.parameters, self.covariance, {n: np.array(x) for n, x in self.per_log.items()})
-            )
-        return {
-            "format": _FORMAT,
-            **estimate,
-            **dump(self.evaluation),
-            # Its notes hold the estimate's, too.
-            **dump(_Provenance(**{n: getattr(self, n) for n in _Provenance.__dataclass_fields__})),
-            **dump(self._derived()),
-            "settings": self.settings.to_dict(),
-            "model": self.model.to_dict(),
-        }
-
-    def _derived(self) -> _Derived:
-        return _Derived(
-            self.units,
-            self.standard_errors,
-            self.intervals(),
-            self.structural_intervals() if self.has_structure else None,
-            self.structure if self.has_structure else None,
-            self.violations,
-            self.verdict,
-            self.findings,
-        )
+        return result_files.as_dict(self)
 
     @classmethod
     def from_dict(cls, data: object) -> Result:
         """Result from the mapping that `to_dict` returned.
 
-        Parameters
-        ----------
-        data : object
-            Decoded JSON.
-
-        Returns
-        -------
-        Result
-
-        Raises
-        ------
-        ResultError
-            The data are of another format, or damaged.
+        Raises ResultError: the data are of another format, or damaged.
         """
-        found = data.get("format") if isinstance(data, Mapping) else None
-        if type(found) is not int:
-            raise ResultError("this is no result of diransac; give a file that identify wrote")
-        if found != _FORMAT and found not in _SINCE:
-            writer = "an earlier version" if found < _FORMAT else "a later version"
-            raise ResultError(
-                f"the result has format {found}, of {writer} of diransac; this one reads {min(_SINCE)} to {_FORMAT}. "
-                "Identify again"
-            )
-        assert isinstance(data, Mapping)
-        try:
-            return cls._from_checked({**_SINCE.get(found, {}), **data})
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
-            reason = str(error).partition("\n")[0]
-            raise ResultError(
-                f"the result is damaged: {type(error).__name__} at {reason:.200}; identify again"
-            ) from error
-
-    @classmethod
-    def _from_checked(cls, data: Mapping[str, Any]) -> Result:
-        data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
-        model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
-        estimate, evaluation = load(Estimate, data), load(Evaluation, data)
-        layout = ParameterLayout(model.parameters, len(plain.logs))
-        if tuple(estimate.parameters) != layout.names or not np.isfinite(estimate.values).all():
-            raise ValueError(f"parameters {', '.join(estimate.parameters)}")
-        n_rows = sum(log.n_rows for log in plain.logs)
-        masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
-        if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
-            raise ValueError(f"a mask of other than {n_rows} rows")
-        if estimate.diagnosis is not None:
-            estimate.diagnosis.check_windows()
-        check_terms(estimate.possible_terms or ())
-        if not _is_covariance(estimate.covariance):
-            raise ValueError("covariance: it is that of no distribution")
-        _check_resolution(estimate.resolution, model.n_u)
-        if not 1 <= estimate.degrees_of_freedom <= 2**53:
-            raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
-        for log in plain.logs:
-            if not (log.n_rows > 0 and 0.0 < log.dt < np.inf and np.isfinite(log.start)):
-                raise ValueError(f"a log of {log.n_rows} rows, {log.dt} s apart")
-        settings = Settings.from_dict(data["settings"])
-        found = cls(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
-        found._derived(), str(found)  # fail where names and figures do not fit together
-        return found
+        return result_files.from_data(data, cls)
 
     def save(self, path: str | Path) -> None:
-        """Write the result as JSON, atomically.
-
-        Parameters
-        ----------
-        path : str or Path
-
-        Raises
-        ------
-        ResultError
-            The file cannot be written.
-        """
-        _write(path, self._text())
+        """Write the result as JSON, atomically.  Raises ResultError: the file cannot be written."""
+        result_files.write(path, self._text())
 
     @classmethod
     def load(cls, path: str | Path) -> Result:
         """Result from a file that `save` wrote.
 
-        Parameters
-        ----------
-        path : str or Path
-
-        Returns
-        -------
-        Result
-
-        Raises
-        ------
-        ResultError
-            There is no such file, or it does not contain a result; the message names the file.
+        Raises ResultError: there is no such file, or it contains no result; the message names the file.
         """
         try:
             data = json_data(read_text(path))
@@ -737,98 +489,9 @@ class Result:
         values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.items())
         return f"<Result of {self.method} for {self.model.name}: {values}; {self.verdict}>"
 
+    def __str__(self) -> str:
+        return text_of(self)
+
     def _repr_html_(self) -> str:
         """Parameters, verdict and the findings against the result, as a notebook shows them."""
-        from html import escape
-
-        header, *rows = ([escape(cell) for cell in row] for row in self._cells())
-        table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-        findings = "".join(f"<li>{escape(x)}</li>" for x in shown_lines(self.findings))
-        return (
-            f"<p>{escape(self._headline())}: <strong>{self.verdict}</strong></p>"
-            f"<table><tr>{''.join(f'<th>{cell}</th>' for cell in header)}</tr>{table}</table>"
-            + (f"<ul>{findings}</ul>" if findings else "")
-            + f"<p>{escape(next_line(self.findings))}</p>"
-        )
-
-    def __str__(self) -> str:
-        parts = (self._headline(), *aligned(self._cells()), *self._prior_lines(), self._summary())
-        return "\n".join([*parts, *self._diagnosed(), *self._assessed()])
-
-    def _headline(self) -> str:
-        many = len(self.logs) > 1
-        seconds = sum(log.dt * (log.n_rows - 1) for log in self.logs)
-        source = f"{len(self.logs)} logs" if many else self.logs[0].source
-        rates = sorted({f"{1.0 / log.dt:.4g}" for log in self.logs}, key=float)
-        rate = rates[0] if len(rates) == 1 else f"{rates[0]} to {rates[-1]}"
-        return f"{self.model.name} by {self.method} from {source} ({seconds:.4g} s at {rate} Hz)"
-
-    def _cells(self) -> list[tuple[str, ...]]:
-        """Header and rows of the table of parameters."""
-        columns = {"95 % interval": self.intervals()}
-        if self.has_structure:
-            columns = {
-                "95 % interval if the model is complete": self.intervals(),
-                "if it may lack a term": self.structural_intervals(),
-            }
-        rows = [("parameter", "estimate", *columns, "unit")]
-        for name in self.parameters:
-            intervals = [self._interval(name, *x[name]) for x in columns.values()]
-            estimate = "?" if name in self.unidentifiable else f"{self.parameters[name]:.6g}"
-            varies = not self.layout.is_shared and self.model.parameters[name].per_log
-            averaged = varies and name not in self.fixed
-            rows.append((f"{name} (mean of logs)" if averaged else name, estimate, *intervals, self.units[name]))
-        return rows
-
-    def _interval(self, name: str, low: float, high: float) -> str:
-        """An interval of a parameter as text."""
-        digits = telling_digits(low, high)
-        interval = f"{low:.{digits}g} .. {high:.{digits}g}" if np.isfinite(high - low) else "unknown"
-        return "fixed" if name in self.fixed else interval
-
-    def _prior_lines(self) -> list[str]:
-        """The priors, in a line; none without them."""
-        texts = [f"{n} = {mean:.6g} ± {std:.2g} {self.units[n]}" for n, (mean, std) in self.priors.items()]
-        return [f"prior of {'; '.join(texts)}"] if texts else []
-
-    def _summary(self) -> str:
-        whole = "" if self.diagnosis is None else "in one simulation of the whole log: "
-        parts = [f"{whole}fit error {self.fit_error:.4g}", f"inliers {100.0 * self.inlier_fraction:.1f} %"]
-        if self.estimate.resolution.interpolation:
-            parts.append(self.estimate.resolution.interpolation)
-        parts.append(f"fitted to {self.n_fitted} rows")
-        if self.iterations:
-            rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejected.items())
-            parts.append(f"{self.iterations} sample{'s' if self.iterations > 1 else ''}, {self.stop_reason}")
-            parts.append(f"{self.n_hypotheses} hypotheses" + (f" ({rejected})" if rejected else ""))
-        return "; ".join(parts)
-
-    def _diagnosed(self) -> list[str]:
-        """Tables of the logs, and of noise, outliers and unexplained accelerations."""
-        lines = [] if len(self.logs) == 1 else ["", *aligned(self._log_lines())]
-        return lines if self.diagnosis is None else [*lines, "", *aligned(self.diagnosis.lines(self.model.units)), ""]
-
-    def _log_lines(self) -> list[list[str]]:
-        """Rows of a table: log, duration, fit error, inliers, per-log parameters."""
-        own, errors = self.per_log, self.per_log_standard_errors
-        rows = [
-            ["log", "s", "fit error", "inliers", *(f"{name} ± standard error [{self.units[name]}]" for name in own)]
-        ]
-        for i, log in enumerate(self.logs):
-            inliers = f"{100.0 * log.inlier_fraction:.1f} %"
-            values = [f"{x[i]:.5g} ± {errors[name][i]:.2g}" for name, x in own.items()]
-            rows.append([log.source, f"{log.dt * (log.n_rows - 1):.4g}", f"{log.fit_error:.4g}", inliers, *values])
-        return rows
-
-    def _assessed(self) -> list[str]:
-        """The verdict, the findings against the result, sensitivities and notes."""
-        lines = [f"verdict: {self.verdict}", *shown_lines(self.findings)]
-        for name, (half, double) in (self.bandwidth_sensitivity or {}).items():
-            lines.append(
-                f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice"
-            )
-        if self.competition is not None:
-            lines.append(f"  {self.competition.sentence()}")
-        remarks = [log.remark for log in self.logs]
-        lines += [f"  {note}" for note in self.notes if note not in remarks]
-        return [*lines, *(f"? {suggestion.change}" for suggestion in self.suggestions), next_line(self.findings)]
+        return html_of(self)

@@ -16,13 +16,25 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["Mask", "Masks", "Number", "NumberPairs", "Numbers", "Series", "Values", "WholeNumbers", "dump", "load"]
+__all__ = [
+    "Form",
+    "Mask",
+    "Masks",
+    "Number",
+    "NumberPairs",
+    "Numbers",
+    "Series",
+    "Values",
+    "WholeNumbers",
+    "dump",
+    "load",
+]
 
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Form:
+class Form:
     """Annotation of a field: how its value is written to JSON and read back."""
 
     encode: Callable[[Any], Any]
@@ -40,9 +52,9 @@ class _Form:
         except (TypeError, AttributeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
-    def by_name(self) -> _Form:
+    def by_name(self) -> Form:
         """The form of a mapping from names to such values."""
-        return _Form(
+        return Form(
             lambda values: {str(name): self.encode(x) for name, x in values.items()},
             lambda data: {str(name): self.decode(x) for name, x in data.items()},
         )
@@ -94,21 +106,22 @@ def _decode_pair(data: Any) -> tuple[float, float]:
     return _decode_number(first), _decode_number(second)
 
 
-_NUMBER, _NUMBERS = _Form(_encode_number, _decode_number), _Form(_encode_numbers, _decode_numbers)
-_MASK = _Form(_encode_mask, _decode_mask)
-_PAIR = _Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair)
+_NUMBER, _NUMBERS = Form(_encode_number, _decode_number), Form(_encode_numbers, _decode_numbers)
+_MASK = Form(_encode_mask, _decode_mask)
 
 Number = Annotated[float, _NUMBER]
 """A number that may be infinite or NaN."""
 Numbers = Annotated[FloatArray, _NUMBERS]
 """An array of numbers of any shape, as nested lists."""
-WholeNumbers = Annotated[IntArray, _Form(lambda values: values.tolist(), _decode_whole_numbers)]
+WholeNumbers = Annotated[IntArray, Form(lambda values: values.tolist(), _decode_whole_numbers)]
 """An array ``(n,)`` of whole numbers."""
 Mask = Annotated[BoolArray, _MASK]
 """An array ``(N,)`` of Booleans, packed."""
 Values = Annotated[Mapping[str, float], _NUMBER.by_name()]
 """Numbers by name."""
-NumberPairs = Annotated[Mapping[str, tuple[float, float]], _PAIR.by_name()]
+NumberPairs = Annotated[
+    Mapping[str, tuple[float, float]], Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair).by_name()
+]
 """Pairs of numbers by name."""
 Series = Annotated[Mapping[str, FloatArray], _NUMBERS.by_name()]
 """Arrays by name."""
@@ -116,19 +129,17 @@ Masks = Annotated[Mapping[str, BoolArray], _MASK.by_name()]
 """Masks by name."""
 
 
-def dump(value: Any) -> Any:
-    """A dataclass as a mapping that JSON can hold; `load` reads it back.
+def dump(value: Any, kind: Any = None) -> Any:
+    """A value as JSON can hold it; `load` reads a dataclass back.
 
     Parameters
     ----------
-    value : dataclass
-
-    Returns
-    -------
-    dict
+    value : object
+    kind : type, optional
+        Its annotation; by default its class.
     """
-    adapter: Any = _adapter(type(value))  # type: ignore[arg-type]  # a class is hashable
-    return adapter.dump_python(value, mode="json")
+    form: Any = type(value) if kind is None else kind
+    return _adapter(form).dump_python(value, mode="json")
 
 
 def load(kind: type[T], data: Mapping[str, Any]) -> T:

@@ -20,13 +20,13 @@ __all__ = [
     "Settings",
     "check_substeps",
     "check_used",
+    "finite_number",
     "nearest_names",
 ]
 
 # Similarity of names, 0 to 1, from which on one is taken for a misspelling of the other.
 MOST_SUBSTEPS = 10_000
 """Integration steps per sample, at most: more are a slip of the pen, and take hours."""
-_NEAR = 0.75
 
 REFITS = ("inliers", "none")
 INITIAL_STATES = ("first", "robust")
@@ -198,7 +198,7 @@ def nearest_names(name: str, known: Sequence[str]) -> str:
     """
     from difflib import get_close_matches
 
-    nearest = get_close_matches(name, known, cutoff=_NEAR)
+    nearest = get_close_matches(name, known, cutoff=0.75)
     return f"did you mean {' or '.join(nearest)}?" if nearest else f"there are {', '.join(known)}"
 
 
@@ -263,3 +263,11 @@ def _by_name(name: str, values: object, lower: float) -> dict[str, float]:
                 f"{name}: {signal} is {x}; give a finite number" + (" of at least 0" if lower == 0.0 else "")
             )
     return numbers
+
+
+def finite_number(what: str, value: object) -> float:
+    """The number itself.  Raises SettingsError: it is none, or not finite."""
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not is_number or not np.isfinite(value):  # type: ignore[call-overload]  # a number
+        raise SettingsError(f"{what} is {value!r:.60}; give a finite number")
+    return float(value)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.dataset import Dataset
-from diransac.identification.inverse_dynamics import PredictedForces, predicted_forces
+from diransac.identification.assessment.inverse_dynamics import PredictedForces, predicted_forces
 from diransac.identification.result import Result
 from diransac.model import Model
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot

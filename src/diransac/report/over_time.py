@@ -10,7 +10,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
-from diransac.identification.estimate import Diagnosis
+from diransac.identification.diagnosis import Diagnosis
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Run
 from diransac.text_table import number, percent, plural, share

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from diransac.data.log import Log
-from diransac.identification.estimate import Resolution
+from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods import default_options
 from diransac.identification.settings import Settings
 from diransac.model import Model

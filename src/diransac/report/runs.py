@@ -14,11 +14,11 @@ from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.identification.departures import Departure, departures
-from diransac.identification.estimate import Diagnosis, LogSummary
-from diransac.identification.evaluation import Scoring, Simulation, as_estimated, choose_scoring, judged_signals
-from diransac.identification.horizons import OpenLoop
-from diransac.identification.prediction import (
+from diransac.identification.assessment.horizons import OpenLoop
+from diransac.identification.assessment.validation import Validation, validate
+from diransac.identification.diagnosis import Departure, Diagnosis, departures
+from diransac.identification.estimate import LogSummary
+from diransac.identification.evaluation.prediction import (
     Restarts,
     SimulatedLog,
     diagnosed_parts,
@@ -27,8 +27,9 @@ from diransac.identification.prediction import (
     simulated_rows,
     unexplained,
 )
+from diransac.identification.evaluation.scoring import Scoring, as_estimated, choose_scoring, judged_signals
+from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.result import Result
-from diransac.identification.validation import Validation, validate
 from diransac.report.rendering import numbered
 from diransac.simulation import inlier_mask
 

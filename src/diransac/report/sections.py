@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac.data.log import Log
-from diransac.identification.estimate import Finding, Level
-from diransac.identification.findings import Verdict, bounds_text, next_line, shown, verdict_of
-from diransac.identification.horizons import HorizonScores
-from diransac.identification.innovations import Innovations
-from diransac.identification.validation import Validation
+from diransac.identification.assessment.horizons import HorizonScores
+from diransac.identification.assessment.innovations import Innovations
+from diransac.identification.assessment.validation import Validation
+from diransac.identification.evaluation.findings import bounds_text
+from diransac.identification.finding import Finding, Level, Verdict, next_line, shown, verdict_of
 from diransac.report.figures import Scale, Tick, padded, ticks
 from diransac.report.rendering import Table
 from diransac.report.runs import Entry, Run

@@ -18,9 +18,9 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.errors import IdentificationError
-from diransac.identification.estimators import Estimator, OrdinaryLeastSquares
-from diransac.identification.identifiability import of_log
-from diransac.identification.nonlinear import NonlinearLeastSquares
+from diransac.identification.regression.estimators import Estimator, OrdinaryLeastSquares
+from diransac.identification.regression.nonlinear import NonlinearLeastSquares
+from diransac.identification.structure.identifiability import of_log
 from diransac.model.plant import DisturbedModel, Plant
 from diransac.simulation.compiler import compile_map
 

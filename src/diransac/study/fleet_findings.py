@@ -26,7 +26,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import SettingsError
-from diransac.identification.uncertainty import student_quantile
+from diransac.identification.regression.uncertainty import student_quantile
 from diransac.study.fleet import FleetRows, FleetStatus, read_fleet
 from diransac.text_table import aligned, number, plural
 

@@ -155,7 +155,7 @@ def _cross_validate(
     as_json: JsonFlag = False,
 ) -> None:
     """Identify from all logs but one, and predict that one, for each in turn."""
-    from diransac.identification.cross_validation import cross_validate
+    from diransac.identification.assessment.cross_validation import cross_validate
 
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))

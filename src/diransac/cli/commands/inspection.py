@@ -15,7 +15,7 @@ from diransac.cli.outputs import staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.views import CacheState, Equations, ModelList, Recorded
 from diransac.data.readers import read_fields, read_topics
-from diransac.identification.inspection import inspect
+from diransac.identification.assessment.inspection import inspect
 from diransac.simulation.compiler.code_cache import CodeCache
 
 __all__ = ["app"]

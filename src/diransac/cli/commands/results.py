@@ -45,7 +45,7 @@ def _validate(
     strict: StrictFlag = False,
 ) -> None:
     """Predict other logs with an identified model, open loop."""
-    from diransac.identification.validation import validate
+    from diransac.identification.assessment.validation import validate
 
     derivation.check()
     check_ending(report, PAGE)
@@ -79,7 +79,7 @@ def _predict(
 ) -> None:
     """Simulate an identified model over the inputs of a log, and write the simulated signals."""
     from diransac.data.preprocessing import in_units
-    from diransac.identification.open_loop import simulate
+    from diransac.identification.assessment.open_loop import simulate
 
     derivation.check()
     start = numbers("--initial", initial) if initial else None

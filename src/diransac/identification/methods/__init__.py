@@ -36,9 +36,9 @@ WITH_ESTIMATOR = ("diransac", "i-diransac")
 """Names of the methods with an estimator inside."""
 
 _ESTIMATORS = {
-    "ols": "estimators:OrdinaryLeastSquares",
-    "tls": "estimators:TotalLeastSquares",
-    "nls": "nonlinear:NonlinearLeastSquares",
+    "ols": "regression.estimators:OrdinaryLeastSquares",
+    "tls": "regression.estimators:TotalLeastSquares",
+    "nls": "regression.nonlinear:NonlinearLeastSquares",
 }
 ESTIMATORS = tuple(_ESTIMATORS)
 """Names of these estimators, those of the methods that fit all rows with them."""

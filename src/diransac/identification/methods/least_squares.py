@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.errors import IdentificationError
-from diransac.identification.estimate import Estimate, Resolution
-from diransac.identification.estimators import (
+from diransac.identification.diagnosis import Resolution
+from diransac.identification.estimate import Estimate
+from diransac.identification.method import report
+from diransac.identification.regression.estimators import (
     BoundEstimator,
     Estimator,
     OrdinaryLeastSquares,
     TotalLeastSquares,
-    as_estimator,
-    name_of,
 )
-from diransac.identification.identifiability import check_structure, in_words, of_log, vague_parameters
-from diransac.identification.method import report
-from diransac.identification.motion_rows import motion_rows
-from diransac.identification.nonlinear import BoundNonlinear, NonlinearLeastSquares
-from diransac.identification.refusal import cause_of_refusal, check_known_terms
+from diransac.identification.regression.nonlinear import BoundNonlinear, NonlinearLeastSquares
+from diransac.identification.regression.rows import motion_rows
+from diransac.identification.regression.scikit_learn import as_estimator, name_of
+from diransac.identification.regression.uncertainty import N_BLOCKS, jackknife_covariance
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
-from diransac.identification.uncertainty import N_BLOCKS, jackknife_covariance
+from diransac.identification.structure.identifiability import in_words, of_log, vague_parameters
+from diransac.identification.structure.refusal import cause_of_refusal, check_known_terms
+from diransac.identification.structure.structural import check_structure
 from diransac.time_limit import time_unlimited
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 __all__ = ["LeastSquares", "bound_to", "fitted"]
-
-_NAMES = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ class LeastSquares:
     def name(self) -> str:
         """``"ols"``, ``"tls"``, ``"nls"``, or the name of the estimator's class."""
         known = name_of(self._estimator)
-        return _NAMES.get(known, known)
+        names = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
+        return names.get(known, known)
 
     @property
     def _estimator(self) -> Estimator:

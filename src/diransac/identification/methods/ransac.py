@@ -16,23 +16,24 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 import numpy as np
 
 from diransac.errors import IdentificationError, LogError, TimeLimitError
-from diransac.identification.estimate import TIME_LIMIT, Estimate, Resolution
-from diransac.identification.estimators import Estimator, OrdinaryLeastSquares, as_estimator, name_of
-from diransac.identification.evaluation import choose_scoring
+from diransac.identification.diagnosis import Resolution
+from diransac.identification.estimate import TIME_LIMIT, Estimate
+from diransac.identification.evaluation.scoring import choose_scoring
 from diransac.identification.method import report
 from diransac.identification.methods.least_squares import bound_to, fitted
-from diransac.identification.methods.samples import Evaluator, Hypothesis, Samples, Score, fingerprint
-from diransac.identification.motion_rows import motion_rows
-from diransac.identification.nonlinear import NonlinearLeastSquares
-from diransac.identification.refusal import cause_of_refusal
-from diransac.identification.sampling import sample_rows
+from diransac.identification.methods.samples import Evaluator, Hypothesis, Samples, Score, fingerprint, sample_rows
+from diransac.identification.regression.estimators import Estimator, OrdinaryLeastSquares
+from diransac.identification.regression.nonlinear import NonlinearLeastSquares
+from diransac.identification.regression.rows import motion_rows
+from diransac.identification.regression.scikit_learn import as_estimator, name_of
 from diransac.identification.settings import JUDGING, SIMULATION, Settings, check_used
+from diransac.identification.structure.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.estimators import BoundEstimator
     from diransac.identification.method import Callback
+    from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Model
 
 __all__ = [
@@ -44,7 +45,6 @@ __all__ = [
     "search",
 ]
 
-_FIRST_BATCH = 16
 _OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 
@@ -367,7 +367,7 @@ def search(variant: RansacMethod, samples: Samples, callback: Callback | None = 
 def _batches(settings: Settings) -> Iterator[range]:
     """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
     may_stop = settings.stop_inlier_fraction is not None
-    start, size = 0, min(_FIRST_BATCH, settings.batch_size) if may_stop else settings.batch_size
+    start, size = 0, min(16, settings.batch_size) if may_stop else settings.batch_size
     while start < settings.max_iterations:
         stop = min(start + size, settings.max_iterations)
         yield range(start, stop)

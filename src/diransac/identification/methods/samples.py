@@ -7,30 +7,23 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError
-from diransac.identification.estimate import Resolution
-from diransac.identification.evaluation import (
-    Scores,
-    Scoring,
-    Simulation,
-    mean_squared_error,
-    rms_error,
-    stretches_of,
-)
+from diransac.identification.diagnosis import Resolution
+from diransac.identification.evaluation.scoring import Scoring, mean_squared_error, rms_error
+from diransac.identification.evaluation.simulation import Scores, Simulation, stretches_of
 from diransac.simulation.compiler.machine_code import LANES
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.estimators import BoundEstimator
+    from diransac.identification.regression.estimators import BoundEstimator
     from diransac.identification.settings import Settings
 
 __all__ = ["Evaluator", "FittedSamples", "Hypothesis", "Samples", "Score", "ScoredBatch", "fingerprint"]
 
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
-
-_MOST_KEPT = 2**24  # bytes
 
 
 @dataclass(frozen=True)
@@ -199,7 +192,7 @@ class Samples:
         self.estimator, self._evaluator = estimator, evaluator
         self._sampler, self._sample_size, self._seed = sampler, sample_size, seed
         self._kept: dict[range | bytes, FittedSamples] = {}
-        self._room = _MOST_KEPT
+        self._room = 2**24  # bytes
 
     def batch(self, iterations: range) -> FittedSamples:
         """Samples of consecutive iterations."""
@@ -266,3 +259,60 @@ def fingerprint(rows: IntArray, n_rows: int) -> bytes:
     chosen = np.zeros(n_rows, bool)
     chosen[rows] = True
     return np.packbits(chosen).tobytes()
+
+
+def sample_rows(seed: int, iterations: npt.ArrayLike, n_rows: int, start: int, stop: int) -> IntArray:
+    """Positions ``start`` to ``stop`` of the keyed permutations of ``range(n_rows)``.
+
+    Sample ``k`` is the beginning of a pseudo-random permutation of the rows whose key is ``(seed, k)``.  No state is
+    carried from one sample to the next, a sample is extended by reading on, and all arithmetic is integer, so that
+    samples are the same on every machine.
+
+    Parameters
+    ----------
+    seed : int
+        Any integer.
+    iterations : (n,) array_like
+        Index k of each sample.
+    n_rows : int
+        Length of the permutation.
+    start, stop : int
+        Positions that are read, ``0 <= start <= stop <= n_rows``.
+
+    Returns
+    -------
+    (n, stop - start) int array
+        Distinct rows of the log for each sample; other positions of the same permutation do not repeat them.
+
+    References
+    ----------
+    Luby and Rackoff 1988 (a Feistel network of random round functions is a random permutation); Black and Rogaway 2002
+    (cycle walking to a domain of any size); Steele, Lea, Flood 2014 (the SplitMix64 mixer); Salmon et al. 2011
+    (counter-based random numbers).
+    """
+    half = max(1, -(-(n_rows - 1).bit_length() // 2))
+    of_sample = _mixed(_mixed(np.array([int(seed) % 2**64], np.uint64)) + np.asarray(iterations, np.uint64))
+    # Six rounds pass a chi-square test of pairs of positions from 30 rows on; fewer rows need twelve.
+    rounds = np.arange(1, 7 if half > 3 else 13, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    keys = _mixed(of_sample + rounds[:, None])
+    positions = np.tile(np.arange(start, stop, dtype=np.uint64), (len(of_sample), 1))
+    found = _permuted(positions, keys[:, :, None], half)
+    while (outside := found >= n_rows).any():  # until the network takes all of them into the range
+        found[outside] = _permuted(found[outside], keys[:, np.nonzero(outside)[0]], half)
+    return found.astype(np.int64)
+
+
+def _permuted(x: npt.NDArray[np.uint64], keys: npt.NDArray[np.uint64], half: int) -> npt.NDArray[np.uint64]:
+    """A Feistel network: numbers of ``2 half`` bits, permuted by the keys of its rounds."""
+    shift, low = np.uint64(half), np.uint64(2**half - 1)
+    left, right = x >> shift, x & low
+    for key in keys:
+        left, right = right, left ^ (_mixed(right + key) & low)
+    return left << shift | right
+
+
+def _mixed(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """SplitMix64's finalizer, a bijection of 64-bit words."""
+    for places, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(places))) * np.uint64(factor)
+    return x ^ (x >> np.uint64(31))

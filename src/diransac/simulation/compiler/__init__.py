@@ -15,7 +15,6 @@
 | `lanes.py` | arrays of many rollouts, arranged for the time loop |
 | `block_tridiagonal.py`, `block_elimination.py` | block-tridiagonal systems, and their elimination, emitted |
 | `order_statistics.py`, `bisection.py` | order statistics of many rows, and their search, emitted |
-| `feistel.py` | keyed permutations for random samples, emitted |
 
 LLVM is loaded when something is first compiled.
 """

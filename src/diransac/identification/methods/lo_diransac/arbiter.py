@@ -21,7 +21,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.segments import Segments, prior_states, stretches
-from diransac.identification.uncertainty import student_quantile
+from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.segments import ActingInputs

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.identification.estimate import Finding
+from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY
 from diransac.text_table import duration, number, percent
 

@@ -22,16 +22,16 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.smoothing import without_spikes
-from diransac.identification.regression import regression_rows
-from diransac.identification.sampling import sample_rows
+from diransac.identification.methods.samples import sample_rows
+from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
-    from diransac.identification.estimators import BoundEstimator
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.regression.estimators import BoundEstimator
 
 __all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "random_sets", "robust_scores", "weak_form"]
 
@@ -172,7 +172,7 @@ def _nonlinear(
 
 def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> BoundEstimator:
     """Nonlinear least squares over the dataset with smoothed signals, of which every row counts."""
-    from diransac.identification.nonlinear import NonlinearLeastSquares
+    from diransac.identification.regression.nonlinear import NonlinearLeastSquares
 
     segments = tuple(
         replace(

@@ -17,8 +17,9 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.identification.estimate import TIME_LIMIT, Diagnosis, Estimate, Finding, Resolution
-from diransac.identification.identifiability import check_structure, unidentifiable
+from diransac.identification.diagnosis import Diagnosis, Resolution
+from diransac.identification.estimate import TIME_LIMIT, Estimate
+from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
@@ -34,8 +35,9 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
     unmeasured_states,
 )
-from diransac.identification.motion_rows import excited
-from diransac.identification.refusal import check_signs
+from diransac.identification.regression.rows import excited
+from diransac.identification.structure.refusal import check_signs
+from diransac.identification.structure.structural import check_structure, unidentifiable
 from diransac.process import memory_kept, single_threaded
 
 if TYPE_CHECKING:

@@ -11,22 +11,28 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.identification.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.projection import (
     inertia_slopes,
     means_of_windows,
     residuals_of_motion,
 )
-from diransac.identification.term_selection import MeanForces, changes_beside, select_terms, spanned, suggestions_of
+from diransac.identification.structure.candidate_terms import TermLibrary, candidate_terms
+from diransac.identification.structure.term_selection import (
+    MeanForces,
+    changes_beside,
+    select_terms,
+    spanned,
+    suggestions_of,
+)
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
-    from diransac.identification.candidate_terms import CandidateTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.suggestions import Suggestion
+    from diransac.identification.structure.candidate_terms import CandidateTerms
+    from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 

@@ -43,7 +43,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import lineari
 from diransac.identification.methods.lo_diransac.recording_errors import effect_on
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
-from diransac.identification.uncertainty import combined, student_quantile
+from diransac.identification.regression.uncertainty import combined, student_quantile
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:

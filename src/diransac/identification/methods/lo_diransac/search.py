@@ -30,8 +30,8 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_observed_states,
     with_unmeasured_states,
 )
-from diransac.identification.motion_rows import MotionRows
-from diransac.identification.refusal import cause_of_refusal
+from diransac.identification.regression.rows import MotionRows
+from diransac.identification.structure.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:

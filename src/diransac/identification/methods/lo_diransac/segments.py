@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
-from diransac.identification.multistart import least_squares
+from diransac.identification.regression.multistart import least_squares
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from diransac.errors import SettingsError
 from diransac.identification.settings import JUDGING, Settings, check_substeps, check_used
 
 if TYPE_CHECKING:
-    from diransac.identification.candidate_terms import TermLibrary
+    from diransac.identification.structure.candidate_terms import TermLibrary
     from diransac.model import Model
 
 __all__ = ["LoDiransacSettings"]

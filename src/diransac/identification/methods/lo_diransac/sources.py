@@ -10,9 +10,9 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, LogError, SettingsError
-from diransac.identification.estimators import regression
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
-from diransac.identification.uncertainty import student_quantile
+from diransac.identification.regression.rows import regression
+from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def _within_bounds(gram: FloatArray, unit: FloatArray, bounds: Sequence[Paramete
 
 def _nonlinear(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray, FloatArray]:
     """Least squares of the accelerations, of all rows and without each block."""
-    from diransac.identification.nonlinear import NonlinearLeastSquares
+    from diransac.identification.regression.nonlinear import NonlinearLeastSquares
 
     bound = NonlinearLeastSquares().bind(own)
     rows = np.arange(0, bound.n_rows, max(1, bound.n_rows // _MOST_ROWS))

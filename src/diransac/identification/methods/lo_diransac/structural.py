@@ -41,13 +41,13 @@ from diransac.identification.methods.lo_diransac.projection import (
     residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.score_tests import scores_tested, slopes_of_accelerations
-from diransac.identification.structure import PossibleTerm
+from diransac.identification.structure.lacking_terms import PossibleTerm
 
 if TYPE_CHECKING:
-    from diransac.identification.candidate_terms import CandidateTerm, CandidateTerms, TermLibrary
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.structure.candidate_terms import CandidateTerm, CandidateTerms, TermLibrary
 
 __all__ = ["CandidateTests", "candidates_tested", "possible_terms", "weighted"]
 

@@ -1,7 +1,7 @@
 """Trajectories of states that no signal measures, such as the thrust behind the lag of a motor.
 
 Simulations that the smoothed motion of all other states drives, and the smoothed sensors, give parameters and
-trajectories (`identification.driven_states`).  The best of them simulates the shooting intervals best, by the scores of
+trajectories (`regression.observers`).  The best of them simulates the shooting intervals best, by the scores of
 hypotheses. Its trajectories take the place of smoothed signals until shooting estimates these states with all others.
 """
 
@@ -19,9 +19,8 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 if TYPE_CHECKING:
-    from diransac.identification.driven_states import DrivenStates
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.observers import Observers
+    from diransac.identification.regression.observers import DrivenStates, Observers
     from diransac.model import Model
 
 __all__ = [
@@ -117,7 +116,7 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     Motion or None
         None if every simulation diverges.
     """
-    from diransac.identification.multistart import least_squares
+    from diransac.identification.regression.multistart import least_squares
 
     problem = _driven(intervals, motion)
     z, cost = least_squares(problem, problem.starts(), _N_STEPS)
@@ -139,7 +138,7 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     Motion or None
         None if every observer diverges.
     """
-    from diransac.identification.multistart import least_squares
+    from diransac.identification.regression.multistart import least_squares
 
     problem = _observers(intervals, motion)
     z = problem.starts()
@@ -153,7 +152,7 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
-    from diransac.identification.driven_states import DrivenStates
+    from diransac.identification.regression.observers import DrivenStates
 
     model, hidden = intervals.model, unmeasured_states(intervals)
     bandwidth = 1.0 / (_MEMORY * intervals.duration)
@@ -183,7 +182,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
     Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
     kinematics give.
     """
-    from diransac.identification.observers import Observers
+    from diransac.identification.regression.observers import Observers
 
     model, hidden, measured = intervals.model, unmeasured_states(intervals), measured_signals(intervals)
     corrected = {chain[1] for chain in model.chains if chain[0] in measured and len(chain) > 1}

@@ -1,0 +1,329 @@
+"""Inspection of a log before identification: its signals, their faults, and the identifiability of a model."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
+from diransac.data.dataset import Dataset, usable_sensors
+from diransac.data.segment import spelling_notes
+from diransac.errors import IdentificationError, LogError
+from diransac.identification.evaluation.scoring import choose_scoring
+from diransac.identification.regression.estimators import OrdinaryLeastSquares
+from diransac.identification.regression.uncertainty import jackknife_covariance
+from diransac.identification.settings import Settings
+from diransac.identification.structure.columns import contradictions
+from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
+from diransac.identification.structure.refusal import check_motion
+from diransac.identification.structure.structural import structural
+from diransac.text_table import aligned, percent
+
+if TYPE_CHECKING:
+    from diransac.data.log import Log
+    from diransac.model import Model
+
+__all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
+
+
+@dataclass(frozen=True)
+class SignalFacts:
+    """One signal of a log.
+
+    Parameters
+    ----------
+    unit : str
+        Unit; None where the log does not give it.
+    minimum, maximum, standard_deviation : float
+        Statistics of the finite samples, in that unit; NaN where there is none.
+    rate : float
+        Samples per second, Hz: that of the log, or that of a slow signal, which has NaN between its samples.
+    n_missing : int
+        Number of rows without a sample.
+    n_spikes : int
+        Number of samples that a Hampel filter would replace.
+    frozen : float
+        Longest stretch of one value, s; 0 if it is shorter than 10 samples.
+    """
+
+    unit: str | None
+    minimum: float
+    maximum: float
+    standard_deviation: float
+    rate: float
+    n_missing: int
+    n_spikes: int
+    frozen: float
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Ordinary least-squares estimate of a parameter from the whole log, outliers included, and its relative error.
+
+    Parameters
+    ----------
+    unit : str
+        Unit of the parameter.
+    estimate : float
+        Estimate in that unit; NaN where the parameter is not identifiable.
+    relative_error : float
+        Standard error over estimate, by a jackknife; infinite where the parameter is not identifiable.
+    """
+
+    unit: str
+    estimate: float
+    relative_error: float
+
+    @property
+    def verdict(self) -> str:
+        """Degree of excitation: "well" (relative error below 10 %), "weakly" (below 50 %) or "not"."""
+        return "well" if self.relative_error < 0.1 else "weakly" if self.relative_error < 0.5 else "not"
+
+
+@dataclass(frozen=True)
+class Fitness:
+    """Suitability of a log for the identification of a model.
+
+    Parameters
+    ----------
+    model : str
+        Name of the model.
+    missing : tuple of str
+        Signals and inputs that the equations need and the log lacks.
+    derivable : tuple of str
+        Missing signals that differentiation supplies.
+    excitation : mapping of str to Excitation
+        Excitation of each parameter; empty where it cannot be computed.
+    reason : str, optional
+        Reason why it cannot be computed, or why parameters are not identifiable.
+    caveat : str, optional
+        Reason why the estimates are doubtful.
+    bases : mapping of str to str
+        Velocity or acceleration -> the coordinate from which it could be derived, of those that the log lacks.
+    """
+
+    model: str
+    missing: tuple[str, ...]
+    derivable: tuple[str, ...]
+    excitation: Mapping[str, Excitation]
+    reason: str = ""
+    caveat: str = ""
+    bases: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Statistics of a log, returned by `inspect`; printed as a table.
+
+    Parameters
+    ----------
+    source : str
+        Name of the log in messages.
+    n_rows : int
+        Number of rows.
+    start, dt : float
+        First time and sampling time, s.
+    signals : mapping of str to SignalFacts
+        Statistics of each signal.
+    notes : tuple of str
+        Findings on reading, a sentence each.
+    fitness : Fitness, optional
+        Suitability for a model; None where no model was given.
+    events : mapping of str to float
+        Part of the rows in which each event of the mapping holds.
+    """
+
+    source: str
+    n_rows: int
+    start: float
+    dt: float
+    signals: Mapping[str, SignalFacts]
+    notes: tuple[str, ...]
+    fitness: Fitness | None = None
+    events: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first row to the last."""
+        return self.dt * (self.n_rows - 1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON apart from numbers that are not finite."""
+        facts = dataclasses.asdict(self) | {"rate": 1.0 / self.dt, "duration": self.duration}
+        if self.fitness is not None:
+            verdicts = {name: found.verdict for name, found in self.fitness.excitation.items()}
+            facts["fitness"]["verdicts"] = verdicts
+        return facts
+
+    def __str__(self) -> str:
+        end = self.start + self.duration
+        head = f"{self.source}: {self.n_rows} rows at {1.0 / self.dt:.6g} Hz, {self.start:.6g} to {end:.6g} s"
+        rows = [["signal", "unit", "minimum", "maximum", "std", "Hz", "NaN", "spikes", "frozen s"]]
+        rows += [[name, *_cells(facts)] for name, facts in self.signals.items()]
+        held = [f"  event {n}: holds in {percent(x)} of the rows" for n, x in self.events.items()]
+        return "\n".join([head, *aligned(rows), *held, *(f"  {note}" for note in self.notes), *self._fitness_lines()])
+
+    def _fitness_lines(self) -> list[str]:
+        found = self.fitness
+        if found is None:
+            return []
+        lines = ["", f"for {found.model}:"]
+        rest = [found.bases.get(name, name) for name in found.missing if name not in found.derivable]
+        rest = list(dict.fromkeys(rest))
+        lines += [f"  missing: {', '.join(rest)}; name columns with --map, or see diransac map"] if rest else []
+        lines += [f"  derived with --differentiate: {', '.join(found.derivable)}"] if found.derivable else []
+        lines += [f"  {found.reason}"] if found.reason else []
+        if found.excitation:
+            rows = [("parameter", "least squares", "unit", "error", "determined")]
+            for name, x in found.excitation.items():
+                rows.append((name, f"{x.estimate:.4g}", x.unit, f"{100 * x.relative_error:.2g} %", x.verdict))
+            lines += aligned(rows)
+        return lines + ([f"  {found.caveat}"] if found.caveat else [])
+
+
+def inspect(log: Log, model: Model | None = None) -> Inspection:
+    """Statistics of a log, and the identifiability of a model's parameters from it.
+
+    Parameters
+    ----------
+    log : Log
+    model : Model, optional
+        Velocities and accelerations that the model needs and the log lacks are derived, where they can be.
+
+    Returns
+    -------
+    Inspection
+    """
+    continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
+    events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
+    signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
+    fitness = None if model is None else _fitness(log, model)
+    if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
+        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, [log]))
+        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, _caveat(signals, model)])))
+    like = () if model is None else spelling_notes(model, log, (*model.signals, *model.inputs))
+    notes = (*log.notes, *like)
+    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, fitness, events)
+
+
+def _events(log: Log) -> list[str]:
+    """Signals of the log that are events of its mapping."""
+    named = [name for step in log.history if step.get("step") == "map" for name in step.get("events", ())]
+    return [name for name in named if name in log]
+
+
+# ---------------------------------------------------------------------- signals
+
+
+def _signal_facts(log: Log, name: str, continuous: FloatArray) -> SignalFacts:
+    """Statistics of a signal; its spikes are those of its continuous form, without wraps and changes of sign."""
+    values = log[name]
+    finite = values[np.isfinite(values)]
+    low, high, spread = (finite.min(), finite.max(), _standard_deviation(finite)) if len(finite) else (np.nan,) * 3
+    apart = rows_per_sample(np.isfinite(values))
+    run = _longest_run(values if apart == 1 else finite)
+    frozen = run * apart * log.dt if run >= 10 else 0.0
+    with np.errstate(over="ignore"):  # a bound that overflows is infinite, and nothing is beyond it
+        n_spikes = int(preprocessing.hampel(continuous if apart == 1 else continuous[np.isfinite(values)])[0].sum())
+    n_missing, rate = int(np.isnan(values).sum()), 1.0 / (apart * log.dt)
+    return SignalFacts(log.units.get(name), float(low), float(high), float(spread), rate, n_missing, n_spikes, frozen)
+
+
+def _standard_deviation(values: FloatArray) -> float:
+    """Standard deviation, of numbers whose squares may overflow too."""
+    scale = max(np.abs(values).max(), np.finfo(np.float64).tiny)
+    return float(scale * (values / scale).std())
+
+
+def _longest_run(values: FloatArray) -> int:
+    """Samples of the longest stretch of one value."""
+    changes = np.flatnonzero(np.diff(values) != 0.0)
+    return int(np.diff([-1, *changes, len(values) - 1]).max())
+
+
+def _cells(facts: SignalFacts) -> tuple[str, ...]:
+    numbers = (facts.minimum, facts.maximum, facts.standard_deviation)
+    frozen = f"{facts.frozen:.3g}" if facts.frozen else "-"
+    counts = (str(facts.n_missing or "-"), str(facts.n_spikes or "-"), frozen)
+    return (facts.unit or "?", *(f"{x:.5g}" for x in numbers), f"{facts.rate:.4g}", *counts)
+
+
+# ---------------------------------------------------------------------- a model
+
+
+def _fitness(log: Log, model: Model) -> Fitness:
+    missing = tuple(name for name in model.required_signals if name not in log)
+    derived = _derived(log, model) if missing else log
+    derivable = tuple(name for name in missing if name in derived)
+    excitation, reason = dict[str, Excitation](), ""
+    if derivable != missing:
+        later = "lo-diransac estimates them; excitation is known only after identification"
+        reason = "" if set(missing) & set(model.inputs) else later
+    elif model.nonlinear_parameters:
+        names = ", ".join(model.nonlinear_parameters)
+        reason = f"not affine in {names}: excitation is known only after identification"
+    else:
+        try:
+            excitation, reason = _excitation(model, derived)
+        except (LogError, IdentificationError) as error:
+            reason = str(error)
+    return Fitness(model.name, missing, derivable, excitation, reason, bases=_bases(log, model))
+
+
+def _bases(log: Log, model: Model) -> dict[str, str]:
+    """Rates by name -> the coordinate that they are derivatives of, where the log lacks it."""
+    chains = [chain for chain in model.chains if chain[0] in model.coordinates and chain[0] not in log]
+    return {name: chain[0] for chain in chains for name in chain[1:]}
+
+
+def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:
+    """A warning of spikes in the signals of the equations; empty without them."""
+    spiked = [name for name in model.required_signals if name in signals and signals[name].n_spikes]
+    if not spiked:
+        return ""
+    return f"spikes in {', '.join(spiked)} bias these estimates and errors: pass --despike, or use those of identify"
+
+
+def _derived(log: Log, model: Model) -> Log:
+    """The log with signals derived by differentiation; the log itself where none can be."""
+    try:
+        return preprocessing.differentiate(log, model)
+    except LogError:
+        return log
+
+
+def _not_excited(ambiguous: Sequence[Ambiguity], model: Model) -> dict[str, Excitation]:
+    """Excitation of parameters that are not identifiable."""
+    names = [name for x in ambiguous for name in x.names]
+    return {name: Excitation(model.parameters[name].unit, np.nan, np.inf) for name in names}
+
+
+def _excitation(model: Model, log: Log) -> tuple[dict[str, Excitation], str]:
+    """Excitation of each parameter; where some are not identifiable, of those alone, with the reason.
+
+    Raises LogError, IdentificationError: nothing can be identified from the log, or it cannot be scored.
+    """
+    model = model.with_sensors(usable_sensors(model, [log], regression=True)[0])
+    dataset = Dataset.of(model, log)
+    check_motion(dataset)
+    ambiguous = structural(model, ranges=dataset.ranges)
+    if ambiguous:
+        return _not_excited(ambiguous, model), "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
+    bound = OrdinaryLeastSquares().bind(dataset)
+    rows = np.arange(bound.n_rows)
+    selected = bound.select([rows])
+    if not selected.well_defined()[0]:
+        ambiguous = of_log(list(model.parameters), bound.null_space())
+        return _not_excited(ambiguous, model), in_words(ambiguous, 1)
+    estimates = selected.fit()[0]
+    errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
+    relative = np.divide(errors, np.abs(estimates), out=np.full(len(errors), np.inf), where=estimates != 0.0)
+    choose_scoring(dataset, Settings())
+    rated = zip(model.parameters.items(), estimates.tolist(), relative.tolist(), strict=True)
+    return {name: Excitation(parameter.unit, x, error) for (name, parameter), x, error in rated}, ""

@@ -1,0 +1,455 @@
+"""Findings for and against a result, in sentences, and the verdict that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.identification.diagnosis import departures
+from diransac.identification.estimate import TIME_LIMIT
+from diransac.identification.finding import FAR, VALIDATE, Finding, Level, by_seriousness, graded
+from diransac.identification.regression.uncertainty import CLEAR
+from diransac.text_table import duration, number, percent, plural, share
+
+if TYPE_CHECKING:
+    from diransac.identification.diagnosis import Diagnosis
+    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.result import Result
+    from diransac.identification.structure.lacking_terms import Suggestion
+    from diransac.model import Parameter
+
+__all__ = ["bounds_text", "findings_of"]
+
+
+_NEAR = 0.05
+"""Median error of a simulation, over the range of the signal, up to which it is good."""
+_MOST, _HALF, _FEW = 0.7, 0.5, 0.01
+_WIDENED, _AMBIGUOUS = 2.0, 0.1
+"""Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
+_LISTED = 3
+"""Stretches that a sentence names; parameters that a term may change of which there is a finding."""
+_OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
+_STEADY, _UNSTEADY = 0.05, 0.2
+"""Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
+
+
+def findings_of(result: Result) -> tuple[Finding, ...]:
+    """Findings on a result, the most serious first.
+
+    They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its
+    diagnosis. Those that need the logs or the fit itself are made with it, and stored: `Estimate.checks` and
+    `Estimate.mistakes`. Where a mistake of a column explains what is bad, all findings have its action.
+
+    Parameters
+    ----------
+    result : Result
+    """
+    mistakes = result.estimate.mistakes
+    found = by_seriousness(
+        (
+            *mistakes,
+            *result.estimate.checks,
+            *_logs(result),
+            *_suggested(result),
+            *_bounds(result),
+            *_diagnosis(result),
+            *_bodies(result),
+            *_known(result),
+            *_simulation(result),
+            *_inliers(result),
+            *_uncertainty(result),
+            *_structure(result),
+            *_bandwidth(result),
+            *_search(result),
+        )
+    )
+    cause = next((x for x in mistakes if x.level == "bad"), None)
+    if cause is None:
+        return found
+    return tuple(Finding(x.level, x.claim, cause.action) if x.action else x for x in found)
+
+
+# ---------------------------------------------------------------------- bounds
+
+
+def _bounds(result: Result) -> Iterator[Finding]:
+    parameters = result.model.parameters
+    for name in result.violations:
+        bounds = parameters[name.partition("[")[0]]
+        value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
+        claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
+        yield Finding("bad", claim, _remedy(result, "bad"))
+    for name in result.on_bounds:
+        value = number(result.estimate.parameters[name])
+        yield Finding(
+            "bad",
+            f"{name} = {value} is on its bound, where the fit was stopped, so that its interval is unknown",
+            f"widen the bound, or fix the parameter: --fix {name.partition('[')[0]}={value}",
+        )
+    bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
+    if bounded and not (result.violations or result.on_bounds):
+        yield Finding("note", "Every parameter is within its bounds.")
+
+
+def _bodies(result: Result) -> Iterator[Finding]:
+    """Base parameters of a robot that are those of no possible bodies, beyond their uncertainty."""
+    parameters = result.model.parameters
+    if not any(x.combination for x in parameters.values()):
+        return
+    from diransac.model.robots.calibration import impossible_changes
+
+    values = np.array([result.parameters[n] for n in parameters])
+    changes = impossible_changes(parameters, values, result.covariance)
+    name = max(changes, key=lambda n: abs(changes[n]), default="")
+    # Of many base parameters, the largest of differences by chance is up to four standard errors.
+    if name and abs(changes[name]) > 4.0:
+        far = number(abs(changes[name]), 2)
+        yield Finding(
+            "care",
+            "No possible bodies (of positive mass, with inertias that satisfy the triangle inequality) have these base "
+            f"parameters, the nearest of which differ by {far} standard errors of {name}; an exported description has "
+            "these",
+            "add the term that the model lacks, or record a longer log",
+        )
+
+
+def _known(result: Result) -> Iterator[Finding]:
+    """Fixed parameters, priors, and priors that the logs contradict."""
+    for name in result.fixed:
+        value = f"{number(result.parameters[name])} {result.units[name]}".rstrip()
+        yield Finding("note", f"{name} is fixed at {value}, not identified.")
+    for name, x in result.estimate.parameters.items():
+        mean, std = result.priors.get(name.partition("[")[0], (np.nan, np.nan))
+        away = abs(x - mean) / std
+        if away > CLEAR:
+            text = (
+                f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
+            )
+            far = f"{number(x)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
+            yield Finding(
+                "care", f"{text[0].upper()}{text[1:]}, since the estimate {far}", f"check the prior of {name}"
+            )
+        elif np.isfinite(away):
+            yield Finding("note", f"The estimate of {name} uses the prior {number(mean)} ± {number(std, 2)}.")
+
+
+def bounds_text(parameter: Parameter) -> str:
+    """Bounds as text: ``> 0``, ``≥ 0``, ``0 to 2``; empty without bounds."""
+    if parameter.positive and parameter.lower <= 0.0:
+        return "> 0" if np.isinf(parameter.upper) else f"> 0, ≤ {number(parameter.upper)}"
+    if np.isinf(parameter.lower) and np.isinf(parameter.upper):
+        return ""
+    if np.isinf(parameter.upper):
+        return f"≥ {number(parameter.lower)}"
+    if np.isinf(parameter.lower):
+        return f"≤ {number(parameter.upper)}"
+    return f"{number(parameter.lower)} to {number(parameter.upper)}"
+
+
+# ---------------------------------------------------------------------- simulation and inliers
+
+
+def _remedy(result: Result, level: Level = "care") -> str:
+    """Action for an answer that is off throughout, by the causes that were tested."""
+    if result.suggestions:
+        return _added(result.suggestions[0])
+    if result.estimate.n_columns_tested:
+        tested = f"{result.estimate.n_columns_tested} other signs and units of columns explain the log no better"
+        return f"compare the terms and constants of the model with the machine ({tested})"
+    if level == "bad":
+        return "check the signs and units of the log, which could not be tested, and the terms of the model"
+    return "compare the terms and constants of the model with the machine"
+
+
+def _added(suggestion: Suggestion) -> str:
+    """The action that adds a suggested term."""
+    return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
+
+
+def _suggested(result: Result) -> Iterator[Finding]:
+    """The terms that the model lacks."""
+    for x in result.suggestions:
+        yield Finding("care", f"The model seems to lack a term. {x.text}", _added(x))
+
+
+def _simulation(result: Result) -> Iterator[Finding]:
+    """Errors of the simulations relative to the signals' ranges, of the worst log.
+
+    Where the method restarts simulations, one of a whole log needs care at worst, because unmodelled forces accumulate
+    in it.
+    """
+    logs, restarts = result.logs, result.separates_forces
+    for one, found in _predicted(logs):
+        if np.isfinite(found.divergence):
+            where = f" in {one.source}" if len(logs) > 1 else ""
+            yield Finding(
+                "bad" if np.isfinite(found.restart_period) or not restarts else "care",
+                f"The simulation diverges at t = {number(found.divergence)} s{where}",
+                _remedy(result, "bad"),
+            )
+    scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
+    if scored:
+        one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
+        yield _median_error(result, found, _worst_of(one, logs))
+    if any(one.prediction is None for one in logs):
+        yield Finding(
+            "care",
+            "No simulation is compared with the log, because its initial state is missing",
+            VALIDATE,
+        )
+
+
+def _median_error(result: Result, found: Prediction, where: str) -> Finding:
+    """Finding on the signal with the largest median error of a simulation."""
+    errors = found.relative_errors
+    name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
+    level = graded(errors[name], _NEAR, FAR)
+    what = share(errors[name], "its range")
+    if restarted:
+        method = f"simulations restarted every {number(found.restart_period)} s"
+        what = f"{what} in excess of the noise"
+        if not errors[name]:
+            return Finding(level, f"Median error of {method}: within the noise, in every signal.")
+    else:
+        method = "one simulation of the whole log"
+        level = "care" if result.separates_forces and level == "bad" else level
+    others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
+    claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
+    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
+
+
+def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
+    return [(one, one.prediction) for one in logs if one.prediction is not None]
+
+
+def _worst_of(one: LogSummary, logs: Sequence[LogSummary]) -> str:
+    """The log's name as a suffix, if there are several."""
+    return f" ({one.source}, the worst of {plural(len(logs), 'log')})" if len(logs) > 1 else ""
+
+
+def _inliers(result: Result) -> Iterator[Finding]:
+    """The inlier fraction of all logs, and the window with the fewest inliers."""
+    logs, fraction, predicted = result.logs, result.inlier_fraction, _predicted(result.logs)
+    if not np.isfinite(fraction):
+        return
+    n_rows = sum(found.n_rows for _, found in predicted) or sum(one.n_rows for one in logs)
+    text = f"{percent(fraction)} of {plural(n_rows, 'row')} agree with"
+    if result.separates_forces:
+        yield Finding(
+            "note",
+            f"{text} an open-loop simulation of the whole log, in which effects of unmodelled forces and errors of its "
+            "start add up, and grow where the machine is unstable.",
+        )
+        return
+    if fraction < _HALF:
+        claim = f"{text} the simulation, which is less than half of the log"
+        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
+        return
+    if fraction >= _MOST:
+        yield Finding("good", f"{text} the simulation.")
+    else:
+        yield Finding("care", f"{text} the simulation", "identify with --method lo-diransac")
+    for one, found in predicted:
+        begin, end, lowest = found.weakest_window
+        if lowest < _HALF * fraction:
+            where = f" of {one.source}" if len(logs) > 1 else ""
+            between = f"Between {number(begin)} and {number(end)} s{where}"
+            claim = f"{between} only {percent(lowest)} of the rows agree with the simulation"
+            yield Finding("care", claim, f"look at it, or leave it out: --leave-out={begin:.4g}:{end:.4g}")
+
+
+# ---------------------------------------------------------------------- diagnosis and uncertainty
+
+
+def _diagnosis(result: Result) -> Iterator[Finding]:
+    """Outliers, unexplained accelerations, input delay and parameters that are not identifiable."""
+    found = result.diagnosis
+    if found is None:
+        return
+    name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
+    most = found.outlier_fraction[name]
+    if most > _FEW:
+        text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
+        # Beyond two thirds the estimate of lo-diransac is arbitrary.
+        if most <= 2.0 / 3.0:
+            if most <= _HALF:
+                yield Finding("note", f"{text}; the estimate down-weights them.")
+            else:
+                yield Finding("care", f"{text}, which the estimate down-weights", f"look at {name}, or leave it out")
+        else:
+            yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result, 'bad')}")
+    yield from _departures(result.logs, found)
+    yield from _unexplained(result)
+    if found.input_delay_significant:
+        sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
+        time = duration(abs(found.input_delay))
+        late, what = f"Inputs act {time} {sense} than recorded", "delay"
+        if lag:
+            late, what = f"Inputs act after a first-order lag of the actuators of {time} (time constant)", "lag"
+        yield Finding("care", f"{late}, which the estimate includes", f"give other simulations this {what}, too")
+    yield from _unidentifiable(result, found)
+
+
+def _departures(logs: Sequence[LogSummary], found: Diagnosis) -> Iterator[Finding]:
+    """Stretches in which the model does not hold."""
+    for i, one in enumerate(logs):
+        known = {} if one.prediction is None else one.prediction.unexplained
+        stretches = departures(found, i, known)
+        if stretches:
+            listed = ", ".join(f"{number(x.start, 3)} to {number(x.stop, 3)} s" for x in stretches[:_LISTED])
+            more = f" and {len(stretches) - _LISTED} more" if len(stretches) > _LISTED else ""
+            option = ",".join(f"{x.start:.4g}:{x.stop:.4g}" for x in stretches)
+            ratio = number(max(x.ratio for x in stretches), 2)
+            yield Finding(
+                "care",
+                f"The model does not hold from {listed}{more}{_worst_of(one, logs)}: forces that it lacks are up to "
+                f"{ratio} times as large there as elsewhere, as on the ground, in the hand, at a stop or at a limit of "
+                "the inputs",
+                f"leave it out, unless a term explains it: --leave-out={option}",
+            )
+
+
+def _unexplained(result: Result) -> Iterator[Finding]:
+    """The largest share of an acceleration that the model leaves unexplained."""
+    having = [(one, found) for one, found in _predicted(result.logs) if found.unexplained]
+    if not having:
+        return
+    one, found = max(having, key=lambda x: max(x[1].unexplained.values()))
+    name = max(found.unexplained, key=lambda n: found.unexplained[n])
+    left = found.unexplained[name]
+    others = ", less of the others" if len(found.unexplained) > 1 else ""
+    text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
+    level = graded(left, _NEAR, _HALF)
+    yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
+
+
+def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
+    if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result, "bad"))
+    for sentence in found.unidentifiable_sentences():
+        claim, _, action = sentence.rpartition("; ")
+        yield Finding("care", claim or sentence, action)
+
+
+def _these(logs: Sequence[LogSummary]) -> str:
+    return "these logs" if len(logs) > 1 else "this log"
+
+
+def _uncertainty(result: Result) -> Iterator[Finding]:
+    """Widths of the confidence intervals."""
+    widths: dict[str, float] = {}
+    intervals = {n: x for n, x in result.intervals().items() if n not in result.fixed}
+    unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
+    stuck = {name.partition("[")[0] for name in result.on_bounds}
+    lost = [name for name in unknown if name not in stuck]
+    if lost and not result.separates_forces:
+        rows = plural(result.n_fitted, "fitted row")
+        claim = f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it"
+        yield Finding("care", claim, "give a longer log")
+    zero: dict[bool, list[str]] = {True: [], False: []}
+    for name, (low, high) in intervals.items():
+        # The mean of a per-log parameter is of no machine: the table of the logs has its values.
+        if name in unknown or (result.model.parameters[name].per_log and not result.layout.is_shared):
+            continue
+        if low <= 0.0 <= high:
+            zero[bool(result.model.parameters[name].admits(0.0))].append(name)
+        else:
+            widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
+    for possible, names in zero.items():
+        if names:
+            claim = f"{', '.join(names)} {_differ(names)} significantly from zero: 0 is in the 95 % interval"
+            yield Finding("note", f"{claim}.") if possible else Finding("care", claim, _more_of(result, names))
+    wide = sorted((n for n, x in widths.items() if x > 0.5), key=lambda n: -widths[n])
+    if wide:
+        listed = ", ".join(f"{n} by ±{percent(widths[n])}" for n in wide)
+        yield Finding("care", f"Uncertain by more than half (95 % interval): {listed}", _more_of(result, wide))
+    if widths and not wide:
+        name = max(widths, key=lambda n: widths[n])
+        what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
+        yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
+
+
+def _differ(names: Sequence[str]) -> str:
+    return "does not differ" if len(names) == 1 else "do not differ"
+
+
+def _more_of(result: Result, names: Sequence[str]) -> str:
+    """Action for uncertain parameters: a motion that moves their terms more, or a value from elsewhere."""
+    one = names[0].partition("[")[0]
+    if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > _HALF for x in result.logs):
+        return _remedy(result)
+    return f"record a log in which the term of {one} is larger, or fix it: --fix {one}=VALUE"
+
+
+def _structure(result: Result) -> Iterator[Finding]:
+    """The parameters that are most uncertain because the model may lack a term."""
+    if not result.has_structure:
+        return
+    intervals, widths = result.structural_intervals(), dict[str, float]()
+    for name, found in result.structure.items():
+        half, value = 0.5 * (intervals[name][1] - intervals[name][0]), abs(result.parameters[name])
+        if found.widening > _WIDENED and half > _AMBIGUOUS * value and name not in result.unidentifiable:
+            widths[name] = half / value if value > 0.0 else np.inf
+    for name in sorted(widths, key=lambda n: -widths[n])[:_LISTED]:
+        found, (low, high) = result.structure[name], (number(x, 3) for x in intervals[name])
+        yield Finding(
+            "care",
+            f"If the model lacks a term, {name} may be anywhere from {low} to {high}, an interval that is "
+            f"{number(found.widening, 2)} times as wide, since {_these(result.logs)} cannot exclude {found.term}",
+            f"record {found.motion}",
+        )
+
+
+def _bandwidth(result: Result) -> Iterator[Finding]:
+    """Sensitivity of the parameters to the bandwidth of the differentiating filter."""
+    changes = result.bandwidth_sensitivity
+    if not changes:
+        return
+    if any(np.isnan(pair).any() for pair in changes.values()):
+        yield Finding("care", "Identification failed at half or twice the filter's bandwidth", _OTHER_BANDWIDTH)
+        return
+    name = max(changes, key=lambda n: max(map(abs, changes[n])))
+    change = max(map(abs, changes[name]))
+    if change > _STEADY:
+        claim = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
+        yield Finding(graded(change, _STEADY, _UNSTEADY), claim, _OTHER_BANDWIDTH)
+        return
+    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
+    yield Finding("good", text)
+
+
+# ---------------------------------------------------------------------- search and logs
+
+
+def _search(result: Result) -> Iterator[Finding]:
+    if result.stop_reason == TIME_LIMIT:
+        yield Finding("care", "The time limit ended the search; parameters are the best so far", "give a longer limit")
+        return
+    wanted = result.settings.stop_inlier_fraction
+    if wanted is None or result.separates_forces or not result.iterations:
+        return
+    if result.inlier_fraction < wanted:
+        samples = plural(result.iterations, "sample")
+        yield Finding("note", f"The search ended after {samples}, short of the {percent(wanted)} inliers to stop at.")
+
+
+def _logs(result: Result) -> Iterator[Finding]:
+    """Logs that disagree with the others, excluded rows, and the use of the logs."""
+    for one in result.logs:
+        if one.remark:
+            advice = "leave this log out, or give what differs a value per log"
+            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs", advice)
+    yield from _excluded(result.logs)
+    which = "the logs" if len(result.logs) > 1 else "the log"
+    text = f"Evaluated on {which} of the identification; held-out data are a stricter test."
+    yield Finding("note", text)
+
+
+def _excluded(logs: Sequence[LogSummary]) -> Iterator[Finding]:
+    """Rows in which a required signal is missing."""
+    n_excluded = sum(found.n_excluded for _, found in _predicted(logs))
+    if n_excluded:
+        total = plural(sum(one.n_rows for one in logs), "row")
+        yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")

@@ -1,0 +1,313 @@
+"""Weights and thresholds of a dataset's signals, the errors of eq. (2), and the evaluation of an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data.segment import runs
+from diransac.errors import LogError, SettingsError
+from diransac.identification.estimate import Evaluation
+from diransac.identification.evaluation.simulation import Simulation, Stretch, stretches_of
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset
+    from diransac.data.log import Log
+    from diransac.data.segment import Segment
+    from diransac.identification.diagnosis import Diagnosis
+    from diransac.identification.estimate import Estimate
+    from diransac.identification.settings import Settings
+    from diransac.model import Model
+
+__all__ = ["Scoring", "as_estimated", "choose_scoring", "evaluate", "judged_signals", "mean_squared_error", "rms_error"]
+
+
+# ---------------------------------------------------------------------- weights and thresholds
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """Error weights and inlier thresholds of a dataset's signals.
+
+    Parameters
+    ----------
+    weights : (n_s,) array
+        Weights of eq. (2), one over each signal's unit.
+    thresholds : (n_s,) array
+        Errors below which a signal is an inlier, each signal's unit; 0 switches a signal off.
+    min_inlier_signals : int
+        Number of signals of a row that must be inliers for the row to be one.
+    notes : tuple of str, optional
+        Findings, a sentence each.
+    """
+
+    weights: FloatArray
+    thresholds: FloatArray
+    min_inlier_signals: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def judged(self) -> BoolArray:
+        """Signals ``(n_s,)`` that have a weight or a threshold."""
+        return np.asarray((self.weights > 0.0) | (self.thresholds > 0.0))
+
+
+def judged_signals(model: Model, logs: Sequence[Log], settings: Settings) -> tuple[str, ...]:
+    """Names of the signals that are compared with their simulation: those in the settings, or the default ones.
+
+    Parameters
+    ----------
+    model : Model
+    logs : sequence of Log
+    settings : Settings
+        Weights and thresholds; where either is None, the default signals are compared: velocities and accelerations,
+        coordinates whose velocity is not measured, and sensors, as far as every log has them.
+
+    Returns
+    -------
+    tuple of str
+    """
+    named = {**(settings.error_weights or {}), **(settings.inlier_thresholds or {})}
+    chosen = {n for n, x in named.items() if x > 0.0}
+    if settings.error_weights is None or settings.inlier_thresholds is None:
+        chosen.update(_judged_by_default(model, [n for n in model.signals if all(n in log for log in logs)]))
+    return tuple(n for n in model.signals if n in chosen)
+
+
+def _judged_by_default(model: Model, measured: Sequence[str]) -> tuple[str, ...]:
+    rates = [n for n in (*model.velocities, *model.accelerations, *model.sensors) if n in measured]
+    if model.kinematics is not None:
+        bare = [] if any(n in measured for n in model.velocities) else [q for q in model.coordinates if q in measured]
+    else:
+        bare = [q for q, v, *_ in model.chains if q in model.coordinates and q in measured and v not in measured]
+    return (*bare, *rates)
+
+
+def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
+    """Weights and thresholds from the settings, or from each signal's spread in the dataset where they are None.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    settings : Settings
+
+    Returns
+    -------
+    Scoring
+
+    Raises
+    ------
+    SettingsError
+        The settings name a signal that a log lacks, or every weight is zero, or there are too few thresholds.
+    LogError
+        Every signal is constant.
+    """
+    by_default = _judged_by_default(dataset.model, dataset.common_signals)
+    if not by_default and (settings.error_weights is None or settings.inlier_thresholds is None):
+        raise LogError(
+            f"{dataset.source}: no signal that could be scored is in every log; give one that all logs "
+            "have, or name signals in error_weights and inlier_thresholds"
+        )
+    scales = {n: dataset.scales[n] for n in by_default}
+    constant = [n for n, scale in scales.items() if scale == 0.0]
+    weights, thresholds = settings.error_weights, settings.inlier_thresholds
+    if weights is None or thresholds is None:
+        if len(constant) == len(scales):
+            raise LogError(
+                f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
+            )
+        moving = {n: scale for n, scale in scales.items() if scale > 0.0}
+        slow = _with_accelerations(dataset.model)
+        if weights is None:
+            weights = {n: (0.1 if n in slow else 1.0) / x for n, x in moving.items()}
+        if thresholds is None:
+            thresholds = {n: 0.2 * x for n, x in moving.items()}
+    w, eps = dataset.by_signal(weights), dataset.by_signal(thresholds)
+    if not (w > 0.0).any():
+        raise SettingsError("every error weight is zero; give one signal a positive weight")
+    n_signals = int((eps > 0.0).sum())
+    needed = settings.min_inlier_signals or max(1, -(-n_signals // 2))
+    if needed > n_signals:
+        raise SettingsError(
+            f"min_inlier_signals = {needed}, but {n_signals} signals have an inlier threshold; lower it, or give more "
+            "thresholds"
+        )
+    compared = ", ".join(n for n, x in zip(dataset.signals, eps, strict=True) if x > 0.0)
+    notes = [f"{n} is constant and is not compared" for n in constant]
+    notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
+    return Scoring(w, eps, needed, tuple(notes))
+
+
+def _with_accelerations(model: Model) -> tuple[str, ...]:
+    """Names of the accelerations, and of the sensors that depend on them."""
+    sensors = [n for n, used in model.sensor_arguments.items() if not set(used).isdisjoint(model.accelerations)]
+    return (*model.accelerations, *sensors)
+
+
+# ---------------------------------------------------------------------- simulation
+
+
+def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: Settings) -> Evaluation:
+    """Evaluation of an estimate on the logs that it was made from.
+
+    The simulation has the resolution, timing of the inputs and initial states of the fit.  Rows of gaps do not count.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    dataset : Dataset
+    scoring : Scoring
+        Weights and thresholds.
+    settings : Settings
+        Rule of the initial states, and threads.
+
+    Returns
+    -------
+    Evaluation
+        The fit error is NaN, and there are no inliers, where a log lacks its initial state.
+    """
+    acting, stretches = as_estimated(dataset, estimate.diagnosis, settings)
+    judged, weights = scoring.judged, scoring.weights[scoring.judged]
+    thresholds = {n: float(x) for n, x in zip(dataset.signals, scoring.thresholds, strict=True) if x > 0.0}
+    simulation = Simulation(acting, judged, estimate.resolution, stretches, settings.threads)
+    try:
+        simulation.starts  # noqa: B018  refuses a log without an initial state
+    except LogError:
+        nothing = acting.on_given_logs([np.zeros(len(one), dtype=bool) for one in acting.segments])
+        unknown = np.full(len(acting.segments), np.nan)
+        return Evaluation(np.nan, np.nan, nothing, unknown, unknown, thresholds)
+    scores = simulation.score(estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals)
+    error_of = mean_squared_error if estimate.squared_error else rms_error
+    counts = [one.n_rows for one in acting.segments]
+    parts = list(zip(scores.logs, counts, strict=True))
+    return Evaluation(
+        fit_error=float(error_of(scores.sum_squares, acting.n_rows, weights)[0]),
+        inlier_fraction=float(scores.inlier_count[0] / acting.n_rows),
+        inliers=acting.on_given_logs(scores.inlier_masks(0)),
+        fit_errors=np.array([error_of(one.sum_squares, n, weights)[0] for one, n in parts]),
+        inlier_fractions=np.array([one.inlier_count[0] / n for one, n in parts]),
+        thresholds=thresholds,
+    )
+
+
+def as_estimated(
+    dataset: Dataset, found: Diagnosis | None, settings: Settings
+) -> tuple[Dataset, list[tuple[Stretch, ...]]]:
+    """The dataset with the rows that an estimate simulates, and the simulations of each log.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    found : Diagnosis, optional
+        Outliers and smoothed states; None: simulations start from measured states.
+    settings : Settings
+        Rule of the initial states.
+
+    Returns
+    -------
+    dataset : Dataset
+        The rows that no simulation covers count as gaps.
+    stretches : list of tuple of Stretch
+        With a diagnosis, after a gap: from the first smoothed state.  With ``initial_state="first"``, at the first row:
+        the first sample, replaced by the smoothed state where it is missing or an outlier.
+    """
+    begins = np.cumsum([0, *(len(log) for log in dataset.given)])
+    stretches = []
+    for i, one in enumerate(dataset.segments):
+        first, *others = stretches_of(one, settings.initial_state)
+        if found is not None:
+            others = _resumed(one, i, found)
+            if first.rule != "robust":
+                given = first.rule if isinstance(first.rule, Mapping) else {}
+                start = _first_state(one, i, int(begins[i]) + one.offset, found)
+                first = Stretch(first.rows, {**start, **given})
+        stretches.append((first, *others))
+    segments = tuple(_covered(one, own) for one, own in zip(dataset.segments, stretches, strict=True))
+    return replace(dataset, segments=segments), stretches
+
+
+def _resumed(one: Segment, log: int, found: Diagnosis) -> list[Stretch]:
+    """Simulations after each gap of a log, from the first smoothed state there."""
+    windows = found.windows_of(log)
+    at = np.round((found.smoothed_time[windows] - one.log.time[one.offset]) / one.log.dt).astype(int)
+    stretches = []
+    for rows in runs(~one.gaps)[1:]:
+        inside = np.flatnonzero((at >= rows.start) & (at < rows.stop))
+        if len(inside):
+            state = {name: float(x[windows[inside[0]]]) for name, x in found.smoothed_states.items()}
+            stretches.append(Stretch(slice(int(at[inside[0]]), rows.stop), state))
+    return stretches
+
+
+def _covered(one: Segment, stretches: tuple[Stretch, ...]) -> Segment:
+    """The segment, in which the rows of no stretch are those of a gap."""
+    gaps = np.ones(len(one), bool)
+    for x in stretches:
+        gaps[x.rows] = False
+    return one if np.array_equal(gaps, one.gaps) else replace(one, gaps=gaps, valid=one.valid & ~gaps)
+
+
+def _first_state(one: Segment, log: int, row: int, found: Diagnosis) -> dict[str, float]:
+    """Values of the first row, which is ``row`` of all logs; smoothed ones for what is missing or an outlier."""
+    start = found.first_states(log)
+    for name in start:
+        if name in found.outliers and name in one.present and not found.outliers[name][row]:
+            first = float(one.column(name)[0])
+            start[name] = first if np.isfinite(first) else start[name]
+    return start
+
+
+# ---------------------------------------------------------------------- errors
+
+
+def rms_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+    """``e = sum_i w_i sqrt(sum_j err_ij^2 / N)``, the weighted RMS model-fit error of every hypothesis, eq. (2).
+
+    Parameters
+    ----------
+    sum_squares : (n_hypotheses, n_signals) array
+        Squared errors summed over time, each signal's unit squared; infinite where a rollout diverged.
+    n_rows : int
+        Number of observations N in the sum.
+    weights : (n_signals,) array
+        Weights w, one over each signal's unit.
+
+    Returns
+    -------
+    (n_hypotheses,) array
+        Signals of zero weight are left out, so that no 0 is multiplied by infinity.
+
+    References
+    ----------
+    Dimmig et al. 2023, eq. (2).
+    """
+    return _weighted_sum(np.sqrt(sum_squares / n_rows), weights)
+
+
+def mean_squared_error(sum_squares: FloatArray, n_rows: int, weights: FloatArray) -> FloatArray:
+    """``e = sum_i w_i sum_j err_ij^2 / N``, DIRANSAC's error: eq. (2) without the root.
+
+    Parameters
+    ----------
+    sum_squares : (n_hypotheses, n_signals) array
+    n_rows : int
+    weights : (n_signals,) array
+        As in `rms_error`.
+
+    Returns
+    -------
+    (n_hypotheses,) array
+    """
+    return _weighted_sum(sum_squares / n_rows, weights)
+
+
+def _weighted_sum(errors: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted sum over signals in their order, so that rounding does not depend on shapes."""
+    total = np.zeros(len(errors))
+    for i in np.flatnonzero(weights > 0.0):
+        total += weights[i] * errors[:, i]
+    return total

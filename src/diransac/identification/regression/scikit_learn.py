@@ -1,0 +1,187 @@
+"""Linear regressors of scikit-learn as estimators, and the estimator that a user gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.errors import SettingsError
+from diransac.identification.regression.estimators import (
+    MIN_EIGENVALUE,
+    BoundSums,
+    Estimator,
+    OrdinaryLeastSquares,
+    SelectedRows,
+    column_scale,
+)
+from diransac.identification.regression.rows import NullSpace, regression
+from diransac.identification.regression.uncertainty import rows_without
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset, ParameterLayout
+    from diransac.identification.regression.estimators import BoundEstimator
+
+__all__ = ["LinearRegressor", "ScikitLearnEstimator", "as_estimator", "name_of"]
+
+
+class LinearRegressor(Protocol):
+    """Interface of scikit-learn's linear regressors."""
+
+    def fit(self, X: FloatArray, y: FloatArray) -> Self:
+        """Fit coefficients."""
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Settings by name."""
+
+    def set_params(self, **params: object) -> Self:
+        """Change settings."""
+
+
+@dataclass(frozen=True)
+class ScikitLearnEstimator:
+    """Any scikit-learn linear regressor: fitted without intercept, to columns and right-hand side of unit RMS.
+
+    Parameters
+    ----------
+    regressor : LinearRegressor
+        Regressor with ``fit`` and ``coef_`` (or an ``estimator_`` that has it), such as ``HuberRegressor()``.
+    min_eigenvalue : float, optional
+        As in `OrdinaryLeastSquares`.
+
+    Raises
+    ------
+    SettingsError
+        The regressor cannot be fitted without an intercept.
+    """
+
+    regressor: LinearRegressor
+    min_eigenvalue: float = MIN_EIGENVALUE
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "regressor", _without_intercept(self.regressor))
+
+    def bind(self, dataset: Dataset) -> BoundEstimator:
+        """The estimator over the usable rows of a dataset."""
+        return _BoundScikitLearn(self, *regression(dataset), dataset.layout)
+
+
+class _BoundScikitLearn:
+    """Rows of ``W`` and ``b`` for a scikit-learn regressor; their sums decide whether a set is well-defined."""
+
+    def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout) -> None:
+        self._regressor = estimator.regressor
+        self._sums = BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b, layout)
+        self.n_rows = len(W)
+        scale = column_scale(np.concatenate([W, b[:, :, None]], axis=2))
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        self._W, self._b = W / self._scale[:-1], b / self._scale[-1]
+
+    def select(self, row_sets: Sequence[IntArray]) -> SelectedRows:
+        return SelectedRows(self, row_sets)
+
+    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
+        """Mask of the sets of rows that determine the parameters, by their sums."""
+        return self._sums.select(row_sets).well_defined()
+
+    def null_space(self) -> NullSpace:
+        return self._sums.null_space()
+
+    def correlations(self) -> FloatArray:
+        return self._sums.correlations()
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        return self.fit([rows_without(rows, group) for group in groups])
+
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        shifted = [self.fit([rows], shift)[0] for shift in self._sums.unit_shifts()]
+        return np.array(shifted).reshape(-1, self._W.shape[2]) - self.fit([rows])
+
+    def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
+        """Parameters ``(n_sets, n)`` in their units; priors may be shifted."""
+        prior = self._sums.select(row_sets).prior_sums(shift)
+        roots = np.zeros((len(row_sets), self._W.shape[2])) if prior is None else np.sqrt(prior.weight)
+        mean = np.zeros(self._W.shape[2]) if prior is None else prior.mean
+        fits = np.array([self._fit_one(rows, root, mean) for rows, root in zip(row_sets, roots, strict=True)])
+        return np.asarray(fits.reshape(len(row_sets), -1) * self._scale[-1] / self._scale[:-1])
+
+    def _fit_one(self, rows: IntArray, root: FloatArray, mean: FloatArray) -> FloatArray:
+        """Parameters from rows, and from one row for each prior, by the square root of its weight."""
+        from sklearn.base import clone
+
+        n_p, of_priors = self._W.shape[2], root > 0.0
+        W = np.concatenate([self._W[rows].reshape(-1, n_p), np.diag(root)[of_priors]])
+        b = np.concatenate([self._b[rows].reshape(-1), (root * mean)[of_priors]])
+        try:
+            fitted = clone(self._regressor).fit(W, b)
+        except ValueError:
+            return np.full(n_p, np.nan)
+        holder = getattr(fitted, "estimator_", fitted)
+        return np.asarray(holder.coef_, dtype=float).reshape(n_p)
+
+
+def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
+    """A clone that fits no intercept and draws the same random numbers each time."""
+    from sklearn.base import clone
+    from sklearn.linear_model import LinearRegression
+
+    fresh = clone(regressor)
+    known = fresh.get_params(deep=True)
+    changes: dict[str, Any] = {}
+    if "fit_intercept" in known:
+        changes["fit_intercept"] = False
+    elif "estimator__fit_intercept" in known:
+        changes["estimator__fit_intercept"] = False
+    elif "estimator" in known and known["estimator"] is None:
+        changes["estimator"] = LinearRegression(fit_intercept=False)
+    else:
+        raise SettingsError(
+            f"{type(regressor).__name__} cannot be fitted without an intercept; give a linear regressor"
+        )
+    if "random_state" in known and known["random_state"] is None:
+        changes["random_state"] = 0
+    return cast("LinearRegressor", fresh.set_params(**changes))
+
+
+def as_estimator(candidate: object) -> Estimator:
+    """The estimator itself, or a scikit-learn regressor wrapped as one.
+
+    Parameters
+    ----------
+    candidate : object
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    SettingsError
+        The candidate is neither.
+    """
+    if hasattr(candidate, "bind") and not isinstance(candidate, type):
+        return cast("Estimator", candidate)
+    if hasattr(candidate, "fit") and hasattr(candidate, "get_params") and not isinstance(candidate, type):
+        return ScikitLearnEstimator(cast("LinearRegressor", candidate))
+    raise SettingsError(
+        f"estimator is {candidate!r}; give dr.OrdinaryLeastSquares(), dr.TotalLeastSquares(), "
+        "dr.NonlinearLeastSquares() or a scikit-learn linear regressor"
+    )
+
+
+def name_of(estimator: Estimator) -> str:
+    """Name of an estimator's class, or of the scikit-learn class that it wraps.
+
+    Parameters
+    ----------
+    estimator : Estimator
+
+    Returns
+    -------
+    str
+    """
+    named = estimator.regressor if isinstance(estimator, ScikitLearnEstimator) else estimator
+    return type(named).__name__
