@@ -10,10 +10,18 @@ import diransac as dr
 from diransac.data.dataset import ParameterLayout
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
+from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
+from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
 from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
 from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
+from diransac.identification.methods.lo_diransac.motion_equations import (
+    means_of_intervals,
+    residuals_of_motion,
+    unexplained,
+)
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
     cost,
@@ -21,26 +29,16 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     variances_of_intervals,
     with_residuals,
 )
-from diransac.identification.methods.lo_diransac.projection import (
-    batch_sums,
-    means_of_intervals,
-    projected_candidates,
-    projected_parameters,
-    residuals_of_motion,
-    unexplained,
-)
-from diransac.identification.methods.lo_diransac.recording_errors import JointEquations, effect_on
+from diransac.identification.methods.lo_diransac.projection import projected_candidates, projected_parameters
 from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement, refine_exact
-from diransac.identification.methods.lo_diransac.shooting import ErrorKind, ShootingIntervals
-from diransac.identification.methods.lo_diransac.smoothing import (
-    Samples,
-    choose_half_widths,
+from diransac.identification.methods.lo_diransac.screening import (
     running_median,
     screened_inputs,
-    smooth,
     stuck_rows,
     without_spikes,
 )
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.smoothing import Samples, choose_half_widths, smooth
 from diransac.text_table import duration
 from simulated import MACHINES, flight, rollout
 

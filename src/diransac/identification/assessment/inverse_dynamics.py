@@ -18,7 +18,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import LogError
 from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.smoothing import without_spikes
+from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 
 if TYPE_CHECKING:

@@ -20,13 +20,13 @@ from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor, LogEstimate
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
+from diransac.identification.methods.lo_diransac.interval_effects import effect_of_intervals
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
+from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
-    effect_of_intervals,
     fitted_parameters,
     projected_candidates,
-    unexplained,
     with_parameters,
 )
 from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched

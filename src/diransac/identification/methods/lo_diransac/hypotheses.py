@@ -21,7 +21,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
-from diransac.identification.methods.lo_diransac.smoothing import without_spikes
+from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import Measurements, RolloutBatch, rollouts

@@ -20,18 +20,19 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
 from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
+from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.projection import projected_parameters, unexplained
+from diransac.identification.methods.lo_diransac.projection import projected_parameters
 from diransac.identification.methods.lo_diransac.recording_errors import (
-    RecordingError,
     clear_errors,
     errors_of_inputs,
     errors_of_signals,
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
-from diransac.identification.methods.lo_diransac.shooting import ErrorKind
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time
 

@@ -23,9 +23,10 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
+from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate, parameter_units
+from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals

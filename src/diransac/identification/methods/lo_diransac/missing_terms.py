@@ -11,12 +11,9 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes, residuals_of_motion
 from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
-from diransac.identification.methods.lo_diransac.projection import (
-    inertia_slopes,
-    means_of_windows,
-    residuals_of_motion,
-)
+from diransac.identification.methods.lo_diransac.projection import means_of_windows
 from diransac.identification.structure.candidate_terms import TermLibrary, candidate_terms
 from diransac.identification.structure.term_selection import (
     MeanForces,

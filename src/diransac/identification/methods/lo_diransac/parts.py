@@ -18,15 +18,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
+from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
 from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals, weights_of
-from diransac.identification.methods.lo_diransac.projection import (
-    batch_sums,
-    effect_of_intervals,
-    least_squares_gains,
-    means_of_intervals,
-    means_of_windows,
-    residuals_of_motion,
-)
+from diransac.identification.methods.lo_diransac.projection import least_squares_gains, means_of_windows
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation

@@ -10,17 +10,14 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.segment import long_runs, silent_rows
 from diransac.errors import LogError
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-from diransac.identification.methods.lo_diransac.smoothing import (
-    Motion,
-    Samples,
-    choose_half_widths,
+from diransac.identification.methods.lo_diransac.screening import (
     odd_window,
     running_median,
     screened_inputs,
-    smooth,
     stuck_rows,
 )
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.smoothing import Motion, Samples, choose_half_widths, smooth
 from diransac.simulation import default_threads
 
 if TYPE_CHECKING:

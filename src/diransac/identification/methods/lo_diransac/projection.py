@@ -29,64 +29,49 @@ Plumlee 2017 (discrepancies orthogonal to the model); White 1982 (inference unde
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
+from diransac.identification.methods.lo_diransac.joint_equations import effect_on
+from diransac.identification.methods.lo_diransac.motion_equations import (
+    means_of_intervals,
+    residuals_of_motion,
+    unexplained,
+)
 from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
-from diransac.identification.methods.lo_diransac.recording_errors import effect_on
-from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
-from diransac.identification.regression.uncertainty import combined, student_quantile
-from diransac.simulation.compiler import compile_map
+from diransac.identification.regression.uncertainty import combined
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
-    from diransac.model import Model
-    from diransac.simulation.compiler import Map
 
 __all__ = [
-    "EffectOfIntervals",
     "ProjectedEstimate",
-    "batch_sums",
-    "discrepancy_units",
-    "effect_of_intervals",
-    "equations_of_rows",
     "estimate_parameters",
     "fitted_parameters",
-    "inertia_slopes",
-    "inertial_forces",
     "least_squares_gains",
-    "means_of_intervals",
     "means_of_windows",
-    "parameter_units",
     "projected_candidates",
     "projected_parameters",
-    "residuals_of_motion",
-    "unexplained",
     "with_parameters",
 ]
 
 
-_TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
-# Relative change of a parameter for derivatives of the inertia, and the smallest parameter of which it is one.
-_DIFFERENCE = 1e-4
+_TINY = 1e-300
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
 # Equations per parameter in the longest windows.
 _EQUATIONS = 8
 # Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
-# Fewest batches of correlated intervals.
-_BATCHES = 4
 
 
 @dataclass(frozen=True)
@@ -239,46 +224,6 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     return ProjectedEstimate(p, covariance, left, windows, np.zeros_like(effect.z), np.eye(*effect.s.shape), p)
 
 
-@dataclass(frozen=True)
-class EffectOfIntervals:
-    """Change of a fit's parameters by each interval's measurements, to first order.
-
-    Parameters
-    ----------
-    steps : (W, n) array
-        Changes; zero in sum at the optimum, without priors.
-    covariance : (n, n) array
-        Of the parameters by white noise.
-    z, s : (W, k, n) and (n_s, n) array
-        Result of `Arrowhead.functional` for the parameters.
-    """
-
-    steps: FloatArray
-    covariance: FloatArray
-    z: FloatArray
-    s: FloatArray
-
-
-def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfIntervals:
-    """Effect of each interval's measurements on the parameters of a fit.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        At its optimum.
-
-    Returns
-    -------
-    EffectOfIntervals
-    """
-    n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
-    at = linearize(intervals, fit, weights_of(intervals, fit))
-    z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
-    steps = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
-    return EffectOfIntervals(steps, s[:n_p], z, s)
-
-
 def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
     """The fit with priors of the parameters that hardly count, but keep its equations definite."""
     factor = np.where(np.arange(len(fit.prior)) < intervals.n_p, _WIDER, 1.0)
@@ -348,10 +293,9 @@ class _Rows:
     @classmethod
     def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
         """Equations of the logged rows."""
-        evaluate, motion = _residual_map(intervals.model), _motion(intervals, fit)
+        motion, push, W, M = residuals_of_motion(intervals, fit, fit.shared)
         logged = intervals.counted[:, None]
-        push, W, M = (x * logged for x in evaluate(*motion, _row_parameters(intervals, fit.shared)))
-        W, M = _regressors(intervals, W), _matrices(M, intervals.model.n_v)
+        push, W, M = push * logged, W * logged[:, :, None], M * logged[:, :, None]
         push = push - np.einsum("nij,nj->ni", M, np.repeat(fit.d, intervals.length, axis=0))
         M = means_of_intervals(intervals, M)
         inertial = np.einsum("wij,wj->wi", M, means_of_intervals(intervals, motion[2]))
@@ -532,295 +476,3 @@ def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
     inverse = np.linalg.lstsq(normal, np.eye(len(normal)), rcond=None)[0]
     solved = (inverse / scale[:, None]) @ rows.T
     return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)
-
-
-def batch_sums(values: FloatArray) -> FloatArray:
-    """Sums over neighbouring intervals: their squares count what neighbours have in common.
-
-    A batch has about sqrt(W) intervals, or as many as a first-order autoregression of a column asks for (Andrews 1991,
-    Bartlett's kernel), but a quarter of them at most: a slow current pushes one way for a third of a log.  Sums are
-    increased by Student's t for their number, so that a normal interval has its level, and long ones by what an
-    estimate takes from so few.
-
-    Parameters
-    ----------
-    values : (W, n) array
-        Contributions of the intervals to the error of an estimate.
-
-    Returns
-    -------
-    (n_batches, n) array
-    """
-    usual = round(np.sqrt(len(values)))
-    sums = _sums_of_batches(values, usual)
-    for j, length in enumerate(_correlated(values)):
-        if length > usual:
-            few = _sums_of_batches(values[:, j], length)
-            variance = np.square(few).sum() * len(few) / (len(few) - 1)
-            sums[:, j] *= np.sqrt(max(variance / (np.square(sums[:, j]).sum() + _TINY), 1.0))
-    return sums
-
-
-def _sums_of_batches(values: FloatArray, length: int) -> FloatArray:
-    """Sums over ``length`` intervals each, increased for their number."""
-    sums = np.add.reduceat(values, np.arange(0, len(values), length), axis=0)
-    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
-
-
-def _correlated(values: FloatArray) -> IntArray:
-    """Intervals ``(n,)`` that a batch of each column takes by its correlation with the next interval."""
-    power = np.square(values).sum(axis=0) + _TINY
-    rho = np.clip((values[1:] * values[:-1]).sum(axis=0) / power, 0.0, 1.0 - 1.0 / len(values))
-    alpha = np.square(2.0 * rho / ((1.0 - rho) * (1.0 + rho)))
-    wanted = np.ceil(1.1447 * np.cbrt(alpha * len(values)))
-    return np.asarray(np.minimum(wanted, len(values) // _BATCHES), int)
-
-
-def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
-    """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    parameters : (n,) array
-
-    Returns
-    -------
-    (W, n_v) array
-        0 where an interval has no row that counts.
-    """
-    p = _row_parameters(intervals, parameters)
-    residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
-    left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
-    logged = intervals.counted[:, None].astype(float)
-    return means_of_intervals(intervals, left * logged) / np.maximum(means_of_intervals(intervals, logged), _TINY)
-
-
-def residuals_of_motion(
-    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray
-) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray, FloatArray]:
-    """Residuals of the equations on the fitted motion, and their derivatives.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    parameters : (n,) array
-
-    Returns
-    -------
-    tuple of (N, ...) array
-        q, v, a, the inputs as they act, and the model's parameters in every row.
-    (N, n_v) array
-        Residuals r.
-    (N, n_v, n) array
-        dr/dp, columns in the places of each log's parameters.
-    (N, n_v, n_v) array
-        M = dr/da.
-    """
-    model, motion, p = intervals.model, _motion(intervals, fit), _row_parameters(intervals, parameters)
-    r, W, M = _residual_map(model)(*motion, p)
-    rows = np.broadcast_to(p, (len(r), model.n_p))
-    return (*motion, rows), r, _regressors(intervals, W), _matrices(M, model.n_v)
-
-
-def equations_of_rows(
-    model: Model, q: FloatArray, v: FloatArray, u: FloatArray, p: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Accelerations of the model at any states and inputs, and its regressors there.
-
-    Parameters
-    ----------
-    model : Model
-    q, v, u, p : (N, n) array
-        In every row.
-
-    Returns
-    -------
-    (N, n_v) array, (N, n_v, n_p) array
-        Not finite where the model has no acceleration.
-    """
-    r, _, M = _residual_map(model)(q, v, np.zeros((len(q), model.n_v)), u, p)
-    M = _matrices(M, model.n_v)
-    usable = np.flatnonzero(np.isfinite(M).all(axis=(1, 2)) & np.isfinite(r).all(axis=1))
-    usable = usable[np.linalg.matrix_rank(M[usable]) == model.n_v]
-    a: FloatArray = np.full((len(q), model.n_v), np.nan)
-    a[usable] = -np.linalg.solve(M[usable], r[usable, :, None])[:, :, 0]
-    return a, np.asarray(_matrices(_residual_map(model)(q, v, a, u, p)[1], model.n_p))
-
-
-def inertia_slopes(intervals: ShootingIntervals, motion: Sequence[FloatArray], rows: IntArray) -> FloatArray:
-    """Derivatives of ``M = dr/da`` with respect to the parameters in some rows, by differences.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : sequence of (N, ...) array
-        q, v, a, the inputs as they act, and the model's parameters in every row.
-    rows : (R,) int array
-
-    Returns
-    -------
-    (R, n_v, n_v, n) array
-        Columns in the places of each log's parameters.
-    """
-    model, (*at, p) = intervals.model, (x[rows] for x in motion)
-
-    def inertia(changed: FloatArray) -> FloatArray:
-        return _residual_map(model)(*at, changed)[2]
-
-    before, columns = inertia(p), []
-    for j in range(model.n_p):
-        changed = p.copy()
-        changed[:, j] += _DIFFERENCE * np.maximum(np.abs(p[:, j]), _DIFFERENCE)
-        columns.append((inertia(changed) - before) / (changed - p)[:, j : j + 1])
-    slopes = _by_log(intervals, np.stack(columns, axis=2), intervals.log_of_row[rows])
-    return np.asarray(slopes.reshape(len(rows), model.n_v, model.n_v, -1).swapaxes(1, 2))
-
-
-def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """Discrepancies that equal the inertial force of their equation.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    p : (n,) array
-        Parameters of a hypothesis.
-
-    Returns
-    -------
-    (n_shared,) array
-        Infinite for parameters.
-    """
-    force = inertial_forces(intervals, motion, p)
-    force[force == 0.0] = 1.0  # nor do discrepancies of what is at rest
-    level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
-    level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
-    return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel()])
-
-
-def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """Change of each parameter that equals the inertial force of an equation, or the spread of a sensor.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    p : (n,) array
-        Parameters of a hypothesis.
-
-    Returns
-    -------
-    (n,) array
-        The smallest over equations and sensors, each in its parameter's unit; 0 where a parameter never acts.
-    """
-    model = intervals.model
-    W = _residual_map(intervals.model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[1]
-    logs = intervals.log_of_row[intervals.counted]
-    W, aims = _matrices(W, model.n_p), inertial_forces(intervals, motion, p)
-    if model.measurement is not None:
-        S = _sensor_slopes(model)(*_smoothed(intervals, motion), _row_parameters(intervals, p, logged=True))[0]
-        W = np.concatenate([W, _matrices(S, model.n_p)], axis=1)
-        aims = np.concatenate([aims, motion.spread[-len(model.sensors) :]])
-    sizes = np.sqrt(np.square(_by_log(intervals, W, logs)).mean(axis=0)).T
-    smallest = (aims / np.maximum(sizes, _TINY)).min(axis=1)
-    return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
-
-
-def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
-    """RMS of ``M a`` of each equation.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    p : (n,) array
-        Parameters of a hypothesis.
-
-    Returns
-    -------
-    (n_v,) array
-    """
-    q, v, a, u = _smoothed(intervals, motion)
-    n_v = intervals.model.n_v
-    own = _row_parameters(intervals, p, logged=True)
-    M = _residual_map(intervals.model)(q, v, a, u, own)[2].reshape(len(a), n_v, n_v)
-    return np.asarray(np.sqrt(np.square(np.einsum("nji,nj->ni", M, a)).mean(axis=0)))
-
-
-def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
-    model, logged = intervals.model, intervals.counted
-    q, v, a, _ = motion.parts(model, logged)
-    return q, v, a, intervals.inputs[logged]
-
-
-def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Fitted coordinates, velocities and accelerations, and the inputs as they act, each (N, n)."""
-    model = intervals.model
-    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    q, v, a, _ = split_signals(model, series.reshape(len(intervals.measured), -1))
-    return q, v, a, intervals.inputs
-
-
-def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:
-    """Parameters of the model: one vector for all rows, or (N, n_p) where logs differ; of logged rows, or all."""
-    logs = intervals.log_of_row[intervals.counted] if logged else intervals.log_of_row
-    return intervals.parameters_of(values[: intervals.n_p], logs)
-
-
-def _regressors(intervals: ShootingIntervals, columns: FloatArray) -> FloatArray:
-    """Regressors (N, r, n) from matrices that were stored column by column; zero in other logs' parameters."""
-    return _by_log(intervals, _matrices(columns, intervals.model.n_p), intervals.log_of_row)
-
-
-def _by_log(intervals: ShootingIntervals, W: FloatArray, logs: IntArray) -> FloatArray:
-    """Regressors (N, r, n_p) of rows with their columns in the places of their logs (N, r, n)."""
-    if intervals.layout.is_shared:
-        return W
-    full = np.zeros((*W.shape[:2], intervals.n_p))
-    np.put_along_axis(full, np.broadcast_to(intervals.layout.index[logs][:, None, :], W.shape), W, axis=2)
-    return full
-
-
-@lru_cache(maxsize=64)
-def _residual_map(model: Model) -> Map:
-    """Residuals, and their derivatives with respect to parameters and accelerations, column by column."""
-    q, v, a, u, p = (ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
-    r = model.residual(q, v, a, u, p)
-    slopes = [ca.densify(ca.jacobian(r, x)) for x in (p, a)]
-    return compile_map(ca.Function("residuals", [q, v, a, u, p], [ca.densify(r), *slopes]))
-
-
-@lru_cache(maxsize=64)
-def _sensor_slopes(model: Model) -> Map:
-    """Derivatives of the sensors with respect to parameters, column by column."""
-    assert model.measurement is not None
-    q, v, a, u, p = (ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
-    S = ca.densify(ca.jacobian(model.measurement(q, v, a, u, p), p))
-    return compile_map(ca.Function("sensor_slopes", [q, v, a, u, p], [S]))
-
-
-def means_of_intervals(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
-    """Mean of each interval.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    rows : (N, ...) array
-
-    Returns
-    -------
-    (W, ...) array
-    """
-    return np.asarray(rows.reshape(len(intervals), intervals.length, *rows.shape[1:]).mean(axis=1))
-
-
-def _matrices(columns: FloatArray, n_columns: int) -> FloatArray:
-    """Matrices (N, r, n_columns) that were stored column by column."""
-    return columns.reshape(len(columns), n_columns, -1).swapaxes(1, 2)

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -34,7 +35,6 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     innovations,
     with_residuals,
 )
-from diransac.identification.methods.lo_diransac.recording_errors import JointEquations
 from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
 

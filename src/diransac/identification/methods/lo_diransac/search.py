@@ -15,12 +15,11 @@ from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
 from diransac.identification.methods.lo_diransac.local_search import LATE, LocalSearch
+from diransac.identification.methods.lo_diransac.motion_equations import discrepancy_units, residuals_of_motion
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
-    discrepancy_units,
     estimate_parameters,
     fitted_parameters,
-    residuals_of_motion,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY, errors_of
 from diransac.identification.methods.lo_diransac.refinement import diverges, make_prior, start
@@ -38,8 +37,8 @@ if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.estimate import Competition, LogEstimate
     from diransac.identification.method import Callback
+    from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
     from diransac.identification.methods.lo_diransac.local_search import Explanation
-    from diransac.identification.methods.lo_diransac.recording_errors import RecordingError
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
@@ -13,6 +13,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import acting_inputs
 from diransac.identification.methods.lo_diransac.augmented_model import AugmentedModel, augmented_model
+from diransac.identification.methods.lo_diransac.corrections import ErrorKind, RecordingErrors
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
@@ -20,102 +21,12 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["ErrorKind", "ShootingIntervals"]
+__all__ = ["ShootingIntervals"]
 
 _DIVERGED = 1e6
 _WELL_CONDITIONED = 1e8
 # Rows times squared unknowns from which on derivatives take longer than threads take to be told (a few milliseconds).
 _WORTH_THREADS = 4e6
-
-
-@dataclass(frozen=True)
-class ErrorKind:
-    """Kind of error of a recording, of one signal or input, or of a group alike.
-
-    Parameters
-    ----------
-    columns : tuple of int
-        Indices of the signals, or of the inputs.
-    what : str
-        "delay", in samples; of signals "bias", in their unit; of inputs "lag", the time constant of a first-order lag
-        in samples, and "drift", the relative change of their gain over a log.
-    of_inputs : bool, optional
-    """
-
-    columns: tuple[int, ...]
-    what: Literal["delay", "bias", "lag", "drift"]
-    of_inputs: bool = False
-
-
-@dataclass(frozen=True)
-class RecordingErrors:
-    """Systematic errors of the sensors and of the inputs, and what the sensors measured.
-
-    Parameters
-    ----------
-    measured : (N, n_s) array
-    sampled : (N, n_s) bool array
-        As recorded.
-    n_inputs : int
-    sizes : mapping from ErrorKind to float, optional
-        Errors that are estimated; those of one signal or input add.
-    """
-
-    measured: FloatArray
-    sampled: BoolArray
-    n_inputs: int
-    sizes: Mapping[ErrorKind, float] = field(default_factory=dict)
-
-    @property
-    def kinds(self) -> tuple[ErrorKind, ...]:
-        """Errors that are estimated."""
-        return tuple(self.sizes)
-
-    @property
-    def delay(self) -> FloatArray:
-        """Samples ``(n_s,)`` by which each signal is recorded late."""
-        return self._total("delay", of_inputs=False)
-
-    @property
-    def bias(self) -> FloatArray:
-        """Constant error ``(n_s,)`` of each signal, its unit."""
-        return self._total("bias", of_inputs=False)
-
-    @property
-    def input_delay(self) -> FloatArray:
-        """Samples ``(n_u,)`` after which each input acts."""
-        return self._total("delay", of_inputs=True)
-
-    @property
-    def input_lag(self) -> FloatArray:
-        """Time constant ``(n_u,)`` of each actuator, samples."""
-        return np.maximum(self._total("lag", of_inputs=True), 0.0)
-
-    @property
-    def gain_drift(self) -> FloatArray:
-        """Relative change ``(n_u,)`` of each input's gain over a log."""
-        return self._total("drift", of_inputs=True)
-
-    def _total(self, what: str, *, of_inputs: bool) -> FloatArray:
-        found = np.zeros(self.n_inputs if of_inputs else self.measured.shape[1])
-        for kind, size in self.sizes.items():
-            if kind.what == what and kind.of_inputs == of_inputs:
-                found[list(kind.columns)] += size
-        return found
-
-    def plus(self, more: Mapping[ErrorKind, float]) -> RecordingErrors:
-        """These errors and others.
-
-        Parameters
-        ----------
-        more : mapping from ErrorKind to float
-
-        Returns
-        -------
-        RecordingErrors
-        """
-        sizes = {**self.sizes, **{kind: self.sizes.get(kind, 0.0) + x for kind, x in more.items()}}
-        return replace(self, sizes=sizes)
 
 
 @dataclass(frozen=True)

@@ -32,14 +32,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
-from diransac.identification.methods.lo_diransac.projection import (
-    batch_sums,
+from diransac.identification.methods.lo_diransac.motion_equations import (
     equations_of_rows,
     means_of_intervals,
     residuals_of_motion,
 )
+from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.score_tests import scores_tested, slopes_of_accelerations
 from diransac.identification.structure.lacking_terms import PossibleTerm
 

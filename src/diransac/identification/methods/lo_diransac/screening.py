@@ -1,0 +1,172 @@
+"""Screening of samples and inputs before they are smoothed: stuck rows, leaps, spikes and running medians."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data import preprocessing
+from diransac.data.checks import rows_per_sample
+from diransac.data.filters import median_filter
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["odd_window", "running_median", "screened_inputs", "stuck_rows", "without_spikes"]
+
+# Samples that a window has at least.
+_FEWEST = 5
+# Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
+_SPIKE_WINDOW, _SPIKE_PASSES, _MAD_TO_STD = 5, 20, 1.4826
+# Relative change of a signal that is a rounding error; steps of its resolution that are fewer than two.
+_ROUNDING, _ONE_STEP = 1e-9, 1.5
+
+
+def odd_window(seconds: float, dt: float, most: int) -> int:
+    """Number of samples of a window, odd and from 5 to ``most``.
+
+    Parameters
+    ----------
+    seconds : float
+    dt : float
+        Sampling time, s.
+    most : int
+
+    Returns
+    -------
+    int
+    """
+    return max(_FEWEST, min(most, 2 * round(0.5 * (seconds / dt - 1.0)) + 1))
+
+
+def stuck_rows(measured: FloatArray) -> BoolArray:
+    """Rows that repeat the previous row exactly in every signal: nothing new was measured.
+
+    Signals of a coarse resolution repeat by themselves while they move slowly, and change by one step then; rows
+    are not stuck where each signal does.
+
+    Parameters
+    ----------
+    measured : (N, n) array
+
+    Returns
+    -------
+    (N,) bool array
+    """
+    n, stuck = len(measured), np.zeros(len(measured), bool)
+    stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
+    if not stuck.any():
+        return stuck
+    changes = np.abs(np.diff(measured, axis=0))
+    least = _ROUNDING * np.nan_to_num(np.abs(measured)).max(axis=0)
+    resolution = np.where(changes > least, changes, np.inf).min(axis=0)
+    # Of each row, the next one that is not stuck.
+    free = np.where(stuck, n, np.arange(n))
+    following = np.append(np.minimum.accumulate(free[::-1])[::-1], n)[1:]
+    leaps = np.full(measured.shape, np.inf)
+    ends = following < n
+    leaps[ends] = np.abs(measured[following[ends]] - measured[ends])
+    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1))
+
+
+def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
+    """Inputs whose momentary leaps are replaced by the running median (Hampel filter).
+
+    An error of an input persists in the simulated state, so that the noise model cannot absorb it.
+
+    Parameters
+    ----------
+    inputs : (N, n_u) array
+    window : int
+        Odd number of samples.
+    threshold : float
+        Local standard deviations beyond which an input is replaced.
+
+    Returns
+    -------
+    inputs : (N, n_u) array
+    n_leaps : int
+        Number of rows with a replaced input.
+    """
+    if len(inputs) < window or not inputs.shape[1]:
+        return inputs, 0
+    leaps, median = preprocessing.hampel(inputs, window, threshold, preprocessing.running_deviation)
+    return np.where(leaps, median, inputs), int(leaps.any(axis=1).sum())
+
+
+def without_spikes(inputs: FloatArray, threshold: float) -> tuple[FloatArray, int]:
+    """Inputs whose spikes of one or two samples, large beside their noise, are interpolated.
+
+    Spikes of a measured torque that are smaller than its range escape `screened_inputs`.  Those of a controller look
+    alike, so that simulations must tell which inputs acted.
+
+    Parameters
+    ----------
+    inputs : (N, n_u) array
+    threshold : float
+        Standard deviations of the noise, by second differences, beyond which an input is replaced.  An input without
+        noise, which is held or steps, is kept.
+
+    Returns
+    -------
+    inputs : (N, n_u) array
+    n_spikes : int
+        Number of rows with a replaced input.
+    """
+    if len(inputs) < _SPIKE_WINDOW or not inputs.shape[1]:
+        return inputs, 0
+    columns = [_without_spikes_of_one(u, threshold * _noise_deviation(u)) for u in inputs.T]
+    cleaned = np.column_stack(columns)
+    return cleaned, int((cleaned != inputs).any(axis=1).sum())
+
+
+def _without_spikes_of_one(u: FloatArray, limit: float) -> FloatArray:
+    """One input ``(N,)``, interpolated where it is further than a limit from others beside it.
+
+    Where spikes are frequent, most samples of a window may be spikes: those found are left out before the next medians,
+    and samples that agree with what is interpolated in the end were none.
+    """
+    rows = np.arange(len(u))
+    kept = rows
+    for _ in range(_SPIKE_PASSES):
+        spikes, _ = preprocessing.hampel(u[kept], _SPIKE_WINDOW, 1.0, lambda *_: np.asarray(limit))
+        if not spikes.any() or len(kept) - spikes.sum() < _SPIKE_WINDOW:
+            break
+        kept = kept[~spikes]
+    good = np.abs(u - np.interp(rows, kept, u[kept])) <= limit
+    return np.where(good, u, np.interp(rows, rows[good], u[good]))
+
+
+def _noise_deviation(u: FloatArray) -> float:
+    """Standard deviation of white noise by second differences; infinite where most of these are zero."""
+    usual = float(np.median(np.abs(np.diff(u, 2))))
+    return _MAD_TO_STD / np.sqrt(6.0) * usual if usual > 0.0 else np.inf
+
+
+# ---------------------------------------------------------------------- smoothing
+
+
+def running_median(measured: FloatArray, known: BoolArray, window: int) -> FloatArray:
+    """Median over a window of rows, of 5 samples at least; missing samples are interpolated linearly between medians.
+
+    Parameters
+    ----------
+    measured : (N, n) array
+    known : (N, n) bool array
+        Samples that are measured.
+    window : int
+        Odd number of rows.
+
+    Returns
+    -------
+    (N, n) array
+        0 in signals without a measured sample.
+    """
+    rows, medians = np.arange(len(measured)), np.zeros(measured.shape)
+    for i in np.flatnonzero(known.any(axis=0)):
+        at = rows[known[:, i]]
+        size = max(_FEWEST, 2 * (window // rows_per_sample(known[:, i]) // 2) + 1)
+        medians[:, i] = np.interp(rows, at, median_filter(measured[at, i], min(size, window)))
+    return medians
