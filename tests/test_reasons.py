@@ -11,7 +11,7 @@ import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import motion_rows, solved
-from diransac.identification.structure.columns import contradictions, mistakes_of_columns
+from diransac.identification.structure.columns import contradictions, explanations, mistakes_of_columns
 from simulated import MACHINES, as_log, flight
 
 SEED = 2000
@@ -48,6 +48,23 @@ def test_columns_without_a_mistake_are_not_accused(name):
     assert contradictions(dataset.model, dataset.given) == []
     with np.errstate(all="ignore"):
         assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_equations_that_leave_most_of_their_terms_accuse_no_sign(noisy):
+    """Least squares of noise has parameters of any sign, and small errors."""
+    machine = MACHINES["planar-rotorcraft"]
+    signals, inputs = flight(machine, 1000, 0.01)
+    log = as_log(machine, signals, inputs * [-1.0, 1.0], 0.01)
+    dataset = Dataset.of(dr.models.planar_rotorcraft(), log, pointwise=True)
+
+    def solve(*arguments):
+        found = solved(*arguments)
+        return replace(found, residuals=np.maximum(found.residuals, 0.9 * noisy))
+
+    with np.errstate(all="ignore"):
+        found, _ = explanations(dataset.model, dataset.layout, motion_rows(dataset), dataset.given, solve)
+    assert [x.claim.split(":")[0] for x in found] == ([] if noisy else ["The sign of thrust is reversed"])
 
 
 def test_a_mass_that_changes_is_no_wrong_unit():

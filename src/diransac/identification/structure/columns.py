@@ -48,8 +48,8 @@ _OFFSETS = {"K": ("degC", 1.0, 273.15)}
 # largest logarithm of a ratio over that of a unit; part of the samples that both columns need.
 _SPANS, _AGREES, _SAME_FACTOR, _KNOWN = (1, 4, 16, 64, 256), 0.25, 0.1, 0.05
 # Residual over that without the correction from which on it explains a log much better, and as well; that of the next
-# best correction over it.
-_MUCH_BETTER, _AS_GOOD, _DISTINCT = 0.5, 1.05, 1.5
+# best correction over it.  Part of the terms of an equation from which on it does not hold.
+_MUCH_BETTER, _AS_GOOD, _DISTINCT, _HOLDS = 0.5, 1.05, 1.5, 0.5
 # Samples of the running median that leaves out outliers.
 _MEDIAN = 5
 # Rows of a log that are enough to find a mistake.
@@ -390,9 +390,13 @@ def _much_better(model: Model, logs: Sequence[Log], found: Solution, possible: S
 def _within_bounds(
     model: Model, layout: ParameterLayout, logs: Sequence[Log], found: Solution, possible: Sequence[_Correction]
 ) -> list[Mistake]:
-    """The correction of the fewest signals that brings parameters within their bounds: of a sign, or the only one."""
+    """The correction of the fewest signals that brings parameters within their bounds: of a sign, or the only one.
+
+    Equations that leave most of their terms are those of noise, whose least squares gives any sign.
+    """
     outside = outside_bounds(layout, found)
-    as_good = [x for x in possible if outside and x.solution.residual < _AS_GOOD * found.residual]
+    holding = [x for x in possible if (x.solution.residuals < _HOLDS).all()]
+    as_good = [x for x in holding if outside and x.solution.residual < _AS_GOOD * found.residual]
     fewest = min((len(x.names) for x in as_good), default=0)
     as_good = [x for x in as_good if len(x.names) == fewest]
     signs = [x for x in as_good if x.factor < 0.0]
