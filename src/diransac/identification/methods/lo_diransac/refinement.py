@@ -372,7 +372,7 @@ def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> flo
 
 @dataclass(frozen=True)
 class _Step:
-    """Intervals and fit after a step, its solution, damping of the next, and largest change of an error over its std."""
+    """Intervals and fit after a step, its solution, next damping, and largest change of an error over its std."""
 
     intervals: ShootingIntervals
     fit: Fit
