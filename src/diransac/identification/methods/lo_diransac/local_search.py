@@ -129,10 +129,9 @@ class Explanation:
 
         What it leaves goes with the unmodelled accelerations: if these fall by a factor, so do its residuals, and
         each sample gains the logarithm of it.  It may gain a nat more in every sample, and all that this one has.
-        With errors of inputs, unmodelled accelerations stand for what is left of these, and tell nothing.
         """
         trial, intervals = self.trial, self.intervals
-        if trial is None or trial.length != intervals.length or any(x.of_inputs for x in intervals.all_errors.kinds):
+        if trial is None or trial.length != intervals.length:
             return False
         fallen = max(0.0, float((trial.unexplained - self.unexplained).max()))
         return bool(trial.behind > intervals.known.sum() * (1.0 + fallen) + max(trial.cost - self.cost, 0.0))
@@ -216,10 +215,13 @@ class LocalSearch:
             yield best
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
-            likelier = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
-            if not likelier:
+            found, trial = list[Explanation](), best.trial
+            for one in sorted(self._with_another_error(best, free_hold=free_hold), key=lambda x: x.cost):
+                found.append(self._simplified(replace(one, trial=trial)))
+                trial = found[-1].trial or trial
+            if not found:
                 break
-            best = min(likelier, key=lambda x: x.cost)
+            best = min(found, key=lambda x: x.cost)
             yield best
 
     def _required(self, intervals: ShootingIntervals) -> list[ErrorKind]:
