@@ -1,9 +1,9 @@
 """The quadratic model of all intervals together: measurements, continuity, and priors.
 
-Unknowns are those that all intervals share (parameters, discrepancies, delay), and at the start of each interval w the
+Unknowns are those that all intervals share (parameters, discrepancies), and at the start of each interval w the
 state x_w and an unmodelled acceleration d_w that acts over the interval.  With ``F`` the rollout of an interval,
-``kappa`` the standard deviation of continuity and m the prior means of the shared unknowns (zero for discrepancies and
-delay), twice the cost is
+``kappa`` the standard deviation of continuity and m the prior means of the shared unknowns (zero for
+discrepancies), twice the cost is
 
     sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2
         + |s - m|^2 / prior^2
@@ -55,7 +55,7 @@ class Fit:
     Parameters
     ----------
     shared : (n_s,) array
-        Parameters, discrepancies, input delay in samples.
+        Parameters and discrepancies.
     x : (W, n_x) array
         States at the intervals' starts.
     d : (W, n_v) array
@@ -73,7 +73,7 @@ class Fit:
     continuity_std : (n_x,) array
         Size of the jumps from interval to interval.
     prior : (n_s,) array
-        Size of the discrepancies and of the delay; prior standard deviation of the parameters, infinite without one.
+        Size of the discrepancies; prior standard deviation of the parameters, infinite without one.
     prior_mean : (n_s,) array
         Prior means of the parameters; zero for the others.
     """
