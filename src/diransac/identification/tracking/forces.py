@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,10 +16,10 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["gain_of_forces", "with_forces"]
+__all__ = ["explanations_by_forces", "with_forces"]
 
-# Factors by which unmodelled accelerations may be larger from a time on, and their correlation then.
-_FACTORS, _GUST = 4.0 ** np.arange(1, 6), 0.9
+# Factors by which unmodelled accelerations may be larger than usual, and their correlation then.
+_FACTORS, _GUST = 6.0 ** np.arange(6), 0.9
 
 
 class _Terms(NamedTuple):
@@ -70,27 +71,18 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def gain_of_forces(found: Linearization, age: int) -> float:
-    """Evidence, nats, that larger unmodelled accelerations of the last intervals gain.
+def explanations_by_forces(found: Linearization) -> Iterator[tuple[Linearization, float]]:
+    """The linearised window with larger unmodelled accelerations, as a gust has, and its evidence with each, nats.
 
     Parameters
     ----------
     found : Linearization
-    age : int
-        Number of these intervals.
-
-    Returns
-    -------
-    float
-        The largest over sizes; 0 where none gains.
     """
-    fit, before = found.fit, _evidence(found)
-    recent = (np.arange(len(fit.x)) >= len(fit.x) - age)[:, None]
-    gains = [0.0]
+    fit = found.fit
     for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
         for factor in _FACTORS:
-            gains.append(_evidence(with_forces(found, fit.tau * np.where(recent, factor, 1.0), rho)) - before)
-    return max(gains)
+            scaled = with_forces(found, factor * fit.tau, rho)
+            yield scaled, _evidence(scaled)
 
 
 def _evidence(found: Linearization) -> float:
