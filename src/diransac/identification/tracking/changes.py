@@ -26,7 +26,7 @@ _MEMORY, _AS_EXPECTED = 60.0, 20.0
 _USUAL_CHANGE = 1.0
 # Standard error of the value after a change, over the change, with which it is reported; standard errors within
 # which a parameter has returned to an earlier value.
-_DETERMINED, _RETURNED = 0.2, 3.0
+_DETERMINED, _RETURNED = 0.1, 3.0
 # Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
 _REMEMBERED, _MOST_AGES = 32, 32
 # Kind of a change that goes on, in `ChangeTests`.
@@ -76,6 +76,7 @@ class Changes:
         self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
         self._usual: FloatArray | None = None
         self._full = False
+        self._before = np.full(len(self.names), np.inf)
         self._pending: list[_Pending] = []
         self._reported: list[Change] = []
         self._new: list[Change] = []
@@ -176,11 +177,13 @@ class Changes:
         for one in list(self._pending):
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
-            if change > significant * both and error < _DETERMINED * change:
+            settled = abs(after - self._before[one.index]) < error < _DETERMINED * change
+            if settled and change > significant * both:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
             elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
                 self._pending.remove(one)
+        self._before = window.fit.shared
 
     def _say(self, one: _Pending, after: float, error: float, now: float) -> None:
         """Report a change."""

@@ -12,6 +12,7 @@ from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
+    effect_on_state,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
@@ -84,6 +85,8 @@ class Window:
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
         none = np.zeros_like(fit.noise.sigma)
         self.noise = NoiseSums(none, none, none)
+        self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
+        self._found = np.square(fit.tau)
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
         self.damping = 0.0
         self.last: Linearization | None = None
@@ -161,14 +164,15 @@ class Window:
         float, float
             The parameter before the change, and its standard error.
         """
-        whole, rows = self.fit, first * self.length
+        whole = self.fit
         fit, value, error = self._fit_before(first, index, before)
-        shared = fit.shared.copy()
+        shared, rows = fit.shared.copy(), first * self.length
         shared[index] += change
         assert fit.boundary is not None
-        free = np.zeros((len(shared), 1))
-        free[index] = _FREE * max(abs(shared[index]), abs(change))
-        boundary = fit.boundary.diffused(free)
+        # The change may be within the interval before or after, whose motion is then that of neither.
+        free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
+        free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
+        boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)
@@ -223,10 +227,22 @@ class Window:
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
         process = process_sums(intervals, fit, solved).total()
-        tau = np.maximum(process.likeliest_size(fit.tau), self.least)
+        found = process.likeliest_size(fit.tau)
+        tau = np.maximum(found, self._least_size())
+        self._found = np.square(found)
         rho = np.where(tau > self.least, process.correlation(self.least), 0.0)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
         return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
+
+    def _least_size(self) -> FloatArray:
+        """Least size ``(n_v,)`` of the unmodelled accelerations: that of the last minute, or of an exact model.
+
+        Before the first interval leaves the window, and what noise hides counts for good, it is that of any model of a
+        real machine.
+        """
+        if not self.weight:
+            return self.setup.settings.prior_model_error * self.spread
+        return np.asarray(np.maximum(np.sqrt(self.sizes / self.weight), self.least))
 
     def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
@@ -236,6 +252,7 @@ class Window:
         faded = self.kept**n
         sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         self.noise = sums.plus(self.noise, faded)
+        self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
 
     # ------------------------------------------------------------------ what it tells
 
