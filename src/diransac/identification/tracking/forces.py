@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["explanations_by_forces", "with_forces"]
+__all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
 
 # Factors by which unmodelled accelerations may be larger than usual, and their correlation then.
 _FACTORS, _GUST = 6.0 ** np.arange(6), 0.9
+# Unmodelled accelerations that are large, over those that are expected.
+_LARGE = 30.0
 
 
 class _Terms(NamedTuple):
@@ -83,6 +85,28 @@ def explanations_by_forces(found: Linearization) -> Iterator[tuple[Linearization
         for factor in _FACTORS:
             scaled = with_forces(found, factor * fit.tau, rho)
             yield scaled, _evidence(scaled)
+
+
+def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:
+    """Evidence, nats, that unmodelled accelerations gain over a model that is exact.
+
+    Parameters
+    ----------
+    found : Linearization
+    least, expected : (n_v,) array
+        Sizes of the unmodelled accelerations of an exact model, and those that are expected of any other.
+
+    Returns
+    -------
+    float
+        The larger one of the sizes of the fit, where they are larger than the least, and of some others.
+    """
+    none = np.zeros_like(least)
+    exact = _evidence(with_forces(found, least, none))
+    others = [(expected, none), (_LARGE * expected, none + _GUST)]
+    if (found.fit.tau > least).any():
+        others = [(found.fit.tau, found.fit.rho)]
+    return max(_evidence(with_forces(found, *x)) for x in others) - exact
 
 
 def _evidence(found: Linearization) -> float:

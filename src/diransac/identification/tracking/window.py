@@ -17,6 +17,7 @@ from diransac.identification.methods.lo_diransac.scales import (
     process_sums,
     unbroken_jumps,
 )
+from diransac.identification.tracking.forces import gain_of_freedom
 from diransac.identification.tracking.marginal import marginal
 from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
@@ -34,8 +35,10 @@ _MOST_STEPS, _SETTLED = 3, 0.1
 # Time over which noise and unmodelled accelerations are remembered after the window, s: a minute of a sensor at 1 Hz
 # still gives its noise to 10 %.
 _MEMORY = 60.0
-# Unmodelled accelerations of a model that is exact, over the accelerations: nothing that a sensor shows.
-_EXACT = 3e-5
+# Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
+_EXACT = 1e-6
+# Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
+_AS_LIKELY = 5.0
 # Standard deviation of a parameter of which nothing is known after a change, over the parameter.
 _FREE = 10.0
 
@@ -79,14 +82,15 @@ class Window:
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self.spread = setup, stream, first, fit, spread
-        self.least = _EXACT * spread
+        self.least, self.expected = _EXACT * spread, setup.settings.prior_model_error * spread
         n = len(fit.x)
         self.length = stream.length // setup.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
         none = np.zeros_like(fit.noise.sigma)
         self.noise = NoiseSums(none, none, none)
         self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
-        self._found = np.square(fit.tau)
+        self.freedom = 0.0
+        self._found, self._gained = np.square(fit.tau), np.inf
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
         self.damping = 0.0
         self.last: Linearization | None = None
@@ -220,6 +224,8 @@ class Window:
             if (moved <= _SETTLED * np.sqrt(np.diag(taken.solved.var_p))).all():
                 break
         assert first is not None
+        assert self.last is not None
+        self._gained = gain_of_freedom(self.last, self.least, self.expected)
         return first
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
@@ -227,22 +233,22 @@ class Window:
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
         process = process_sums(intervals, fit, solved).total()
-        found = process.likeliest_size(fit.tau)
-        tau = np.maximum(found, self._least_size())
-        self._found = np.square(found)
-        rho = np.where(tau > self.least, process.correlation(self.least), 0.0)
+        size = process.likeliest_size(fit.tau)
+        self._found = np.square(size)
+        tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
+        rho = np.zeros_like(tau) if self.is_exact else process.correlation(self.expected)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
         return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
 
-    def _least_size(self) -> FloatArray:
-        """Least size ``(n_v,)`` of the unmodelled accelerations: that of the last minute, or of an exact model.
+    @property
+    def is_exact(self) -> bool:
+        """True unless unmodelled accelerations are likelier, in the window and in the last minute before it."""
+        return self.freedom + self._gained < _AS_LIKELY
 
-        Before the first interval leaves the window, and what noise hides counts for good, it is that of any model of a
-        real machine.
-        """
-        if not self.weight:
-            return self.setup.settings.prior_model_error * self.spread
-        return np.asarray(np.maximum(np.sqrt(self.sizes / self.weight), self.least))
+    def _usual_size(self) -> FloatArray:
+        """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
+        usual = np.sqrt(self.sizes / self.weight) if self.weight else np.zeros_like(self.expected)
+        return np.asarray(np.maximum(usual, self.expected))
 
     def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
@@ -253,6 +259,7 @@ class Window:
         sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         self.noise = sums.plus(self.noise, faded)
         self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
+        self.freedom = faded * self.freedom + n / len(intervals) * self._gained
 
     # ------------------------------------------------------------------ what it tells
 
