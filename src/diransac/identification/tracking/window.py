@@ -92,7 +92,6 @@ class Window:
         self.freedom = 0.0
         self._found, self._gained = np.square(fit.tau), np.inf
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
-        self.damping = 0.0
         self.last: Linearization | None = None
 
     def __len__(self) -> int:
@@ -180,7 +179,6 @@ class Window:
         self.first, self.times = self.first + rows, self.times[first:]
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)
-        self.damping = 0.0
         self.optimise()
         return value, error
 
@@ -212,16 +210,19 @@ class Window:
         intervals = self.intervals()
         weights = weights_of_free_motion(self) if is_surprised(self) else None
         first: Linearization | None = None
+        damping = 0.0
         for _ in range(_MOST_STEPS):
             at = linearized(intervals, self.fit, weights)
             before = self.fit
-            taken = gauss_newton_step(intervals, before, at, self.damping)
-            self.last = Linearization(intervals, before, at.of_fit, taken.solved)
-            self.damping = taken.damping
-            self.fit = self._with_scales(intervals, taken.fit, taken.solved)
+            taken = gauss_newton_step(intervals, before, at, damping)
+            # Damping is no information.
+            solved = at.step(at.right).of_fit if damping or taken.damping else taken.solved
+            damping = taken.damping
+            self.last = Linearization(intervals, before, at.of_fit, solved)
+            self.fit = self._with_scales(intervals, taken.fit, solved)
             first = first or self.last
             moved = np.abs(taken.fit.shared - before.shared)
-            if (moved <= _SETTLED * np.sqrt(np.diag(taken.solved.var_p))).all():
+            if (moved <= _SETTLED * np.sqrt(np.diag(solved.var_p))).all():
                 break
         assert first is not None
         assert self.last is not None
