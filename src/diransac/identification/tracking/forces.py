@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
 
-# Factors by which unmodelled accelerations may be larger than usual, and their correlation then.
-_FACTORS, _GUST = 6.0 ** np.arange(6), 0.9
+# Factors by which unmodelled accelerations may be larger than usual, their correlation then, and the number of the
+# last intervals that a gust may be in.
+_FACTORS, _GUST, _RECENT = 6.0 ** np.arange(4), 0.9, 8
 # Unmodelled accelerations that are large, over those that are expected.
 _LARGE = 30.0
 
@@ -73,17 +74,28 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def explanations_by_forces(found: Linearization) -> Iterator[tuple[Linearization, float]]:
-    """The linearised window with larger unmodelled accelerations, as a gust has, and its evidence with each, nats.
+def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterator[tuple[Linearization, float]]:
+    """The linearised window with its unmodelled accelerations, and with larger ones, as a gust has, from a time on.
 
     Parameters
     ----------
     found : Linearization
+    expected : (n_v,) array
+        Size of the unmodelled accelerations of any model.
+
+    Yields
+    ------
+    Linearization
+    float
+        Its evidence, nats.
     """
-    fit = found.fit
-    for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
+    fit, W = found.fit, len(found.fit.x)
+    yield found, _evidence(found)
+    for age in (min(_RECENT, W), W):
+        recent = (np.arange(W) >= W - age)[:, None]
         for factor in _FACTORS:
-            scaled = with_forces(found, factor * fit.tau, rho)
+            tau = np.where(recent, factor * np.maximum(fit.tau, expected), fit.tau)
+            scaled = with_forces(found, tau, np.maximum(fit.rho, _GUST))
             yield scaled, _evidence(scaled)
 
 
