@@ -77,6 +77,8 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
 def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterator[tuple[Linearization, float]]:
     """The linearised window with its unmodelled accelerations, and with larger ones, as a gust has, from a time on.
 
+    One after the other becomes larger, as long as the evidence does.
+
     Parameters
     ----------
     found : Linearization
@@ -90,13 +92,23 @@ def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterat
         Its evidence, nats.
     """
     fit, W = found.fit, len(found.fit.x)
-    yield found, _evidence(found)
-    for age in (min(_RECENT, W), W):
-        recent = (np.arange(W) >= W - age)[:, None]
-        for factor in _FACTORS:
-            tau = np.where(recent, factor * np.maximum(fit.tau, expected), fit.tau)
-            scaled = with_forces(found, tau, np.maximum(fit.rho, _GUST))
-            yield scaled, _evidence(scaled)
+    usual, least = np.broadcast_to(fit.tau, fit.d.shape), np.maximum(fit.tau, expected)
+    rho = np.maximum(fit.rho, _GUST)
+    best, evidence = usual, _evidence(found)
+    yield found, evidence
+    larger = [
+        np.where((np.arange(W) >= W - age)[:, None], factor * least, usual)
+        for age in (min(_RECENT, W), W)
+        for factor in _FACTORS
+    ]
+    for axis in np.eye(len(expected), dtype=bool):
+        trials = [np.where(axis, tau, best) for tau in larger]
+        found_with = [with_forces(found, tau, rho) for tau in trials]
+        evidences = [_evidence(x) for x in found_with]
+        k = int(np.argmax(evidences))
+        if evidences[k] > evidence:
+            best, evidence = trials[k], evidences[k]
+            yield found_with[k], evidence
 
 
 def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:
