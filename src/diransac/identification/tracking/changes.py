@@ -45,13 +45,14 @@ class _Pending:
 
 @dataclass(frozen=True)
 class _Explanation:
-    """A change that explains a window: its evidence, kind, age, parameter, size, and the shift of all before it."""
+    """A change that explains a window, and its evidence, nats; the shift is that of all parameters before it."""
 
     evidence: float
     kind: int = 0
     age: int = 0
     index: int = 0
     size: float = 0.0
+    information: float = 0.0
     shift: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -92,10 +93,11 @@ class Changes:
         of_calm = with_forces(found, *self._usual_forces(window))
         tests = change_tests(of_calm, ages_of(len(window)))
         self._full |= len(window) == window.most
-        if not self._full or self._gain(tests, self._scatter(tests), found.fit.shared).max() < self._price(tests.ages):
+        gain = self._gain(tests, self._scatter(tests.ages, len(window)), window).max()
+        if not self._full or gain < self._price(tests.ages):
             self._learn(window, tests)
         else:
-            self._decide(window, of_calm, tests)
+            self._decide(window, of_calm)
         self._report(window)
         self._follow_drift(window)
 
@@ -122,56 +124,66 @@ class Changes:
         per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
         return float(np.log(per_hour / self.false_alarms))
 
-    def _scatter(self, tests: ChangeTests) -> FloatArray:
-        """Variance ``(2, A, n)`` of the ratios of the tests that is remembered; 1 at least."""
-        places = self._places(tests)
+    def _scatter(self, ages: IntArray, n: int) -> FloatArray:
+        """Variance ``(2, A, n_p)`` of the ratios of tests of some ages in n intervals, as remembered; 1 at least."""
+        places = self._places(ages, n)
         return np.asarray(np.maximum(self._squares[:, places] / self._counts[:, places], 1.0))
 
-    def _places(self, tests: ChangeTests) -> IntArray:
-        """Places ``(A,)`` of the ages in what is remembered; the last one is that of the whole window."""
-        return np.array([*range(len(tests.ages) - 1), _MOST_AGES - 1])
+    def _places(self, ages: IntArray, n: int) -> IntArray:
+        """Places ``(A,)`` of ages in what is remembered: by powers of two; the last one is that of a whole window."""
+        return np.where(ages == n, _MOST_AGES - 1, np.log2(ages).astype(np.int64))
 
     def _learn(self, window: Window, tests: ChangeTests) -> None:
         """Remember the scatter of the tests, and what they tell of the drift."""
-        if self._pending or len(window) < window.most:
-            return
-        faded, weight = np.exp(-self.step / _MEMORY), 1.0 / tests.ages[None, :, None]
-        seen = weight * np.square(tests.ratio), weight * (tests.information > 0.0)
-        places = self._places(tests)
+        is_full = len(window) == window.most
+        ages = slice(None if is_full else -1)
+        places, weight = self._places(tests.ages, len(window))[ages], 1.0 / tests.ages[None, ages, None]
+        seen = np.square(tests.ratio[:, ages]), tests.information[:, ages] > 0.0
+        faded = np.exp(-self.step / _MEMORY)
         for sums, new in zip((self._squares, self._counts), seen, strict=True):
-            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + new
-        T = self._duration(window)
-        size, information = tests.size[0, -1], tests.information[0, -1]
-        self.drift.learn(window.fit.shared, size, information, T, self.step / T)
+            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + weight * new
+        if is_full:
+            T, information = self._duration(window), tests.information[0, -1].copy()
+            information[[x.index for x in self._pending]] = 0.0
+            self.drift.learn(window.fit.shared, tests.size[0, -1], information, T, self.step / T)
 
-    def _gain(self, tests: ChangeTests, scatter: FloatArray, values: FloatArray) -> FloatArray:
+    def _gain(self, tests: ChangeTests, scatter: FloatArray, window: Window) -> FloatArray:
         """Logarithms ``(2, A, n)`` of the Bayes factors of the changes, as eq. (8) of `docs/method.md`."""
         information = tests.information / scatter
-        prior = np.square(_USUAL_CHANGE * values) * information
+        prior = np.square(_USUAL_CHANGE * window.fit.shared) * information
         ratio = np.square(tests.size) * information
         return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
 
     # ------------------------------------------------------------------ a change
 
-    def _decide(self, window: Window, found: Linearization, tests: ChangeTests) -> None:
+    def _decide(self, window: Window, found: Linearization) -> None:
         """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
         best, without = _Explanation(-np.inf), -np.inf
+        ages = fine_ages_of(len(window))
+        scatter = self._scatter(ages, len(window))
         for scaled, evidence in explanations_by_forces(found, window.expected):
             without = max(without, evidence)
-            fine = change_tests(scaled, fine_ages_of(len(window)))
-            gain = evidence + self._gain(fine, np.ones_like(fine.size), found.fit.shared)
+            fine = change_tests(scaled, ages)
+            gain = evidence + self._gain(fine, scatter, window)
             if gain.max() > best.evidence:
                 kind, age, index = (int(x) for x in np.unravel_index(np.argmax(gain), gain.shape))
-                size, shift = float(fine.size[kind, age, index]), fine.shift[kind, age, index]
-                best = _Explanation(float(gain.max()), kind, int(fine.ages[age]), index, size, size * shift)
-        if best.evidence - without < self._price(tests.ages) or best.kind == _RAMP:
-            self._learn(window, tests)
+                size, known = float(fine.size[kind, age, index]), float(fine.information[kind, age, index])
+                shift = size * fine.shift[kind, age, index]
+                best = _Explanation(float(gain.max()), kind, int(ages[age]), index, size, known, shift)
+        if best.evidence - without < self._price(ages_of(len(window))) or best.kind == _RAMP:
             return
+        self._drift_by(window, best)
         first = len(window) - best.age
         time = float(window.times[first])
         value, error = window.release(first, best.index, found.fit.shared + best.shift, best.size)
         self._pending = [x for x in self._pending if x.index != best.index]
         self._pending.append(_Pending(best.index, time, value, error))
+
+    def _drift_by(self, window: Window, change: _Explanation) -> None:
+        """Count a step as one of a drift, which steps that follow one another are."""
+        size, information = np.zeros(len(self.names)), np.zeros(len(self.names))
+        size[change.index], information[change.index] = change.size, change.information
+        self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0)
 
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""

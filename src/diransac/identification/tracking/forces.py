@@ -77,7 +77,7 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
 def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterator[tuple[Linearization, float]]:
     """The linearised window with its unmodelled accelerations, and with larger ones, as a gust has, from a time on.
 
-    One after the other becomes larger, as long as the evidence does.
+    One after the other becomes larger, as long as the evidence does; that which matters most, by every factor.
 
     Parameters
     ----------
@@ -101,14 +101,19 @@ def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterat
         for age in (min(_RECENT, W), W)
         for factor in _FACTORS
     ]
+    strongest: list[tuple[Linearization, float]] = []
+    most = 0.0
     for axis in np.eye(len(expected), dtype=bool):
         trials = [np.where(axis, tau, best) for tau in larger]
-        found_with = [with_forces(found, tau, rho) for tau in trials]
-        evidences = [_evidence(x) for x in found_with]
+        scaled = [with_forces(found, tau, rho) for tau in trials]
+        evidences = [_evidence(x) for x in scaled]
         k = int(np.argmax(evidences))
+        if evidences[k] - evidence > most:
+            strongest, most = list(zip(scaled, evidences, strict=True)), evidences[k] - evidence
         if evidences[k] > evidence:
             best, evidence = trials[k], evidences[k]
-            yield found_with[k], evidence
+            yield scaled[k], evidence
+    yield from strongest
 
 
 def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:

@@ -42,6 +42,8 @@ class SensorWatch:
         window : Window
         """
         first = max(self.seen, window.first)
+        if first >= window.end:  # a window that has begun anew, with rows that were seen before
+            return []
         if self.began < 0:
             self.began = first
         known = np.isfinite(stream.values[first - stream.first : window.end - stream.first])

@@ -33,8 +33,6 @@ class Setup:
     model : Model
     layout : ParameterLayout
         Of one log.
-    parts : int, optional
-        Intervals of a step.
     hold : str, optional
         Inputs between samples, one of `HOLDS`.
     timing : InputTiming, optional
@@ -45,7 +43,6 @@ class Setup:
 
     model: Model
     layout: ParameterLayout
-    parts: int = 1
     hold: str = "zero-order"
     timing: InputTiming = field(default_factory=InputTiming)
     settings: LoDiransacSettings = field(default_factory=LoDiransacSettings)
@@ -70,7 +67,7 @@ class Setup:
         -------
         ShootingIntervals
         """
-        length = stream.length // self.parts
+        length = stream.length // stream.parts
         held = stream.values[: first - stream.first + n * length]
         rows = slice(first - stream.first, len(held))
         measured = held[rows, : self.n_signals]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["Start", "begun", "smoothed_motion"]
 
 # Prior standard deviation of a parameter of which only a rough value is known, over the value.
-_ROUGH = 10.0
+_ROUGH = 1.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     LogError
         The rows are too few, or have too few samples.
     """
-    length = stream.length // setup.parts
+    length = stream.length // stream.parts
     motion = smoothed_motion(setup, stream, first, n * length)
     intervals = setup.intervals(stream, first, n)
     p = given.parameters

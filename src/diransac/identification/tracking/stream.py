@@ -44,6 +44,8 @@ class Stream:
         Time between estimates, s.
     duration : float
         Time over which rows are held, s.
+    parts : int, optional
+        Intervals of a step.
 
     Attributes
     ----------
@@ -67,6 +69,7 @@ class Stream:
     n_inputs: int
     step: float
     duration: float
+    parts: int = 1
     dt: float = 0.0
     length: int = 0
     values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -132,8 +135,8 @@ class Stream:
         n_rows = np.round(apart / np.median(apart)).clip(1.0)
         usual = n_rows < _FEWEST_SILENT  # a gap, or a clock that restarts, is no part of it
         self.dt, self._origin = float(apart[usual].sum() / n_rows[usual].sum()), self._early[0][0]
-        self.length = round(self.step / self.dt)
-        if self.length < 2:
+        self.length = self.parts * round(self.step / (self.parts * self.dt))
+        if self.length < 2 * self.parts:
             raise LogError(
                 f"the stream has a sample every {self.dt:.3g} s, which is too slow for a step of {self.step:g} s; "
                 f"give a step of at least {2.0 * self.dt:.3g} s"

@@ -99,7 +99,9 @@ class Tracker:
         self._names = (*model.signals, *model.inputs)
         self._steps = max(2, round(window / step))
         self._step, self._held = step, _HELD * window
-        self._stream = Stream(len(self._names), model.n_u, step, self._held + step)
+        # Unmodelled accelerations vary as fast off-line as on-line.
+        parts = int(np.ceil(step / self._setup.settings.smoothing_half_width))
+        self._stream = Stream(len(self._names), model.n_u, step, self._held + step, parts)
         self._cold = ColdStart(self._setup, seed, window, background=background)
         self._changes = Changes(self._setup, step, false_alarms_per_hour, drift or {})
         self._sensors = SensorWatch(self._setup)
@@ -185,7 +187,7 @@ class Tracker:
         n = min((end - first) // stream.length, self._steps)
         if n * stream.length * stream.dt < _FIRST - 1e-9 or end < self._retry:
             return
-        parts = self._setup.parts
+        parts = stream.parts
         try:
             window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
             window.optimise()
@@ -204,7 +206,7 @@ class Tracker:
 
     def _advanced(self, window: Window, end: int) -> bool:
         """Move the window on by a step where its rows are complete; False where they are not, or its fit fails."""
-        stream, parts = self._stream, self._setup.parts
+        stream, parts = self._stream, self._stream.parts
         new = stream.fresh >= window.end
         n = self._joining(end) if new else parts
         if n is None or end < window.end + n * window.length:
@@ -227,7 +229,7 @@ class Tracker:
     def _joining(self, end: int) -> int | None:
         """Number of the first intervals of a new stretch; None where there are too few rows."""
         n = (end - self._stream.fresh) // self._stream.length
-        return n * self._setup.parts if n * self._step >= _FIRST - 1e-9 else None
+        return n * self._stream.parts if n * self._step >= _FIRST - 1e-9 else None
 
     def _states(self, window: Window, n: int) -> FloatArray:
         """States with which the first n intervals of a new stretch begin."""

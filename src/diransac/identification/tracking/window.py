@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,45 @@ _FREE = 10.0
 
 
 @dataclass(frozen=True)
+class _Memory:
+    """Sums over intervals that have left the window, which fade.
+
+    Parameters
+    ----------
+    noise : NoiseSums
+    process : ProcessSums
+    sizes : (n_v,) array
+        Squared sizes of the unmodelled accelerations.
+    count : float
+        Number of intervals.
+    freedom : float
+        Evidence, nats, that unmodelled accelerations gain.
+    """
+
+    noise: NoiseSums
+    process: ProcessSums
+    sizes: FloatArray
+    count: float
+    freedom: float
+
+    @classmethod
+    def empty(cls, fit: Fit) -> _Memory:
+        """Sums over no interval."""
+        none = np.zeros_like(fit.noise.sigma)
+        return cls(NoiseSums(none, none, none), ProcessSums.none(len(fit.tau)), np.zeros_like(fit.tau), 0.0, 0.0)
+
+    def extended(self, faded: float, new: _Memory) -> _Memory:
+        """Sums with those over further intervals."""
+        return _Memory(
+            new.noise.plus(self.noise, faded),
+            new.process.plus(self.process, faded),
+            new.sizes + faded * self.sizes,
+            new.count + faded * self.count,
+            new.freedom + faded * self.freedom,
+        )
+
+
+@dataclass(frozen=True)
 class Linearization:
     """Normal equations of a window, the fit that they are of, and their solution.
 
@@ -85,16 +125,12 @@ class Window:
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
-        self.spread = spread[fit.x.shape[1] : fit.x.shape[1] + fit.d.shape[1]]
         self._n_hopeless = 0
-        self.least, self.expected = _EXACT * self.spread, setup.settings.prior_model_error * self.spread
         n = len(fit.x)
-        self.length = stream.length // setup.parts
+        self.length = stream.length // stream.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
-        none = np.zeros_like(fit.noise.sigma)
-        self.noise = NoiseSums(none, none, none)
-        self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
-        self.process, self.freedom = ProcessSums.none(len(fit.tau)), 0.0
+        self.memory = _Memory.empty(fit)
+        self._memories = deque([self.memory], maxlen=most)
         self._found, self._gained = np.square(fit.tau), np.inf
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
         self.last: Linearization | None = None
@@ -106,6 +142,22 @@ class Window:
     def end(self) -> int:
         """Row after the last one of the window."""
         return self.first + len(self) * self.length
+
+    @property
+    def spread(self) -> FloatArray:
+        """Spread ``(n_v,)`` of the accelerations, the largest so far."""
+        n_x, n_v = self.fit.x.shape[1], self.fit.d.shape[1]
+        return self._spread[n_x : n_x + n_v]
+
+    @property
+    def least(self) -> FloatArray:
+        """Unmodelled accelerations ``(n_v,)`` of an exact model."""
+        return _EXACT * self.spread
+
+    @property
+    def expected(self) -> FloatArray:
+        """Unmodelled accelerations ``(n_v,)`` of any model of a real machine."""
+        return self.setup.settings.prior_model_error * self.spread
 
     def intervals(self) -> ShootingIntervals:
         """The intervals with their rows as they are now."""
@@ -184,6 +236,8 @@ class Window:
         free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
         boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
+        # What the change seemed to be until it was found, outliers or forces, is no habit of the machine.
+        self.memory = self._memories[-min(len(self.times) + 1, len(self._memories))]
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)
         self.optimise()
@@ -234,6 +288,8 @@ class Window:
         assert first is not None
         assert self.last is not None
         self._gained = gain_of_freedom(self.last, self.least, self.expected)
+        simulated = self.fit.residuals + intervals.measured
+        self._spread = np.maximum(self._spread, simulated.std(axis=0))
         self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
         return first
 
@@ -251,37 +307,34 @@ class Window:
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
-        noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
+        noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.memory.noise))
         process = process_sums(intervals, fit, solved).total()
         size = process.likeliest_size(fit.tau)
         self._found = np.square(size)
         tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
-        rho = np.zeros_like(tau) if self.is_exact else process.plus(self.process).correlation(self.expected)
+        rho = np.zeros_like(tau) if self.is_exact else process.plus(self.memory.process).correlation(self.expected)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
         return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
 
     @property
     def is_exact(self) -> bool:
         """True unless unmodelled accelerations are likelier, in the window and in the last minute before it."""
-        return self.freedom + self._gained < _AS_LIKELY
+        return self.memory.freedom + self._gained < _AS_LIKELY
 
     def _usual_size(self) -> FloatArray:
         """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
-        usual = np.sqrt(self.sizes / self.weight) if self.weight else np.zeros_like(self.expected)
-        return np.asarray(np.maximum(usual, self.expected))
+        return np.asarray(np.maximum(np.sqrt(self.memory.sizes / max(self.memory.count, 1.0)), self.expected))
 
     def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
         assert self.last is not None
         rows = slice(n * self.length)
         residuals, known = fit.residuals[rows], intervals.known[rows]
-        faded = self.kept**n
-        sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
-        self.noise = sums.plus(self.noise, faded)
-        self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
+        noise = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
-        self.process = process.plus(self.process, faded)
-        self.freedom = faded * self.freedom + n / len(intervals) * self._gained
+        gained = n / len(intervals) * self._gained
+        self.memory = self.memory.extended(self.kept**n, _Memory(noise, process, n * self._found, n, gained))
+        self._memories.append(self.memory)
 
     # ------------------------------------------------------------------ what it tells
 

@@ -113,7 +113,7 @@ class ProcessSums:
         """
         weight = np.maximum(self.weight, _TINY)
         hidden = 1.0 - np.square(now) * np.sqrt(weight / np.maximum(self.count, 1.0))
-        alike = (self.cross / np.maximum(self.weight, self.cross)).clip(0.0, _MOST_ALIKE)
+        alike = np.minimum(self.cross, _MOST_ALIKE * weight) / weight
         chance = np.sqrt(2.0 / weight * (1.0 + alike) / (1.0 - alike))
         size = self.surplus / weight - _CHANCE * hidden.clip(0.0) * chance
         return np.asarray(np.clip(np.sqrt(size.clip(0.0)), SHRINK * now, now / SHRINK))
