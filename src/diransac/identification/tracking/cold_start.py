@@ -32,7 +32,7 @@ class Found:
 
 
 class ColdStart:
-    """Identification of the rows that a stream holds: of one window, then of twice as many each time.
+    """Identification of the rows that a stream holds: of one window, then of twice as many, a window apart at least.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class ColdStart:
     def __init__(self, setup: Setup, seed: int, window: float, *, background: bool) -> None:
         self.setup, self.seed, self.window, self.background = setup, seed, window, background
         self._running: Future[Result] | None = None
-        self._needed = window
+        self._needed, self._not_before = window, 0
 
     def restart(self) -> None:
         """Begin again with the rows of one window."""
@@ -63,7 +63,9 @@ class ColdStart:
             Row after the newest one.
         """
         first = max(stream.first, stream.fresh)
-        if self._running is None and (end - first) * stream.dt >= self._needed:
+        enough = (end - first) * stream.dt >= self._needed and end >= self._not_before
+        if self._running is None and enough:
+            self._not_before = end + round(self.window / stream.dt)
             self._running = self._identified(stream, first, end)
         if self._running is None or (self.background and not self._running.done()):
             return None

@@ -11,8 +11,9 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.refinement import bounded, gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
+    SHRINK,
     ProcessSums,
     effect_on_state,
     negligible_jumps,
@@ -39,7 +40,8 @@ _MOST_STEPS, _SETTLED = 3, 0.1
 _MEMORY = 60.0
 # Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
 _EXACT = 1e-6
-# Part of the spread of a signal from which on its noise leaves nothing to explain; as in `search`.
+# Part of the spread of a signal from which on its noise leaves nothing to explain, and of its samples for outliers; as
+# in `search`.
 _ALL_OF_IT = 0.8
 # Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
 _AS_LIKELY = 5.0
@@ -230,6 +232,7 @@ class Window:
         fit, value, error = self._fit_before(first, index, before)
         shared, rows = fit.shared.copy(), first * self.length
         shared[index] += change
+        shared = bounded(self.intervals(), fit.shared, shared)
         assert fit.boundary is not None
         # The change may be within the interval before or after, whose motion is then that of neither.
         free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
@@ -288,8 +291,7 @@ class Window:
         assert first is not None
         assert self.last is not None
         self._gained = gain_of_freedom(self.last, self.least, self.expected)
-        simulated = self.fit.residuals + intervals.measured
-        self._spread = np.maximum(self._spread, simulated.std(axis=0))
+        self._follow_spread(intervals)
         self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
         return first
 
@@ -298,11 +300,18 @@ class Window:
         """True if the fit has explained nothing in as many steps as the window has intervals."""
         return self._n_hopeless >= self.most
 
+    def _follow_spread(self, intervals: ShootingIntervals) -> None:
+        """Raise the spread of the signals to that of the fitted motion, with a delay of a window."""
+        now = (self.fit.residuals + intervals.measured).std(axis=0)
+        share = 1.0 / self.most
+        self._spread = self._spread * np.clip(now / self._spread, 1.0, 1.0 / SHRINK) ** share
+
     def _explains_nothing(self, intervals: ShootingIntervals) -> bool:
         """True if noise or unmodelled accelerations are as large as the signals themselves."""
         seen = intervals.known.any(axis=0)
-        noise = (self.fit.noise.sigma > _ALL_OF_IT * self._spread)[seen].all()
-        return bool(noise or (self.fit.tau > self.spread).any())
+        noise = self.fit.noise
+        nothing = ((noise.sigma > _ALL_OF_IT * self._spread) | (noise.pi > _ALL_OF_IT))[seen].all()
+        return bool(nothing or (self.fit.tau > self.spread).any())
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""

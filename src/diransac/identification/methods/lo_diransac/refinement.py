@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 __all__ = [
-    "Prior", "Refinement", "Step", "diverges", "gauss_newton_step", "linearized", "make_prior", "refine",
+    "Prior", "Refinement", "Step", "bounded", "diverges", "gauss_newton_step", "linearized", "make_prior", "refine",
     "refine_exact", "start",
 ]  # fmt: skip
 
@@ -434,14 +434,14 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
     """The fit after a step whose shared unknowns stay within their bounds."""
-    shared, n_x = _bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
+    shared, n_x = bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
     z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
     x, d = fit.x + z[:, :n_x], fit.d + z[:, n_x:]
     return with_residuals(intervals, replace(fit, shared=shared, x=x, d=d))
 
 
-def _bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) -> FloatArray:
-    """Parameters within their bounds; a positive one at most halves or doubles."""
+def bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) -> FloatArray:
+    """Shared unknowns ``(n_s,)``, parameters within their bounds; a positive one at most halves or doubles."""
     then = then.copy()
     for j, bounds in enumerate(intervals.layout.bounds):
         then[j] = np.clip(then[j], bounds.lower, bounds.upper)
