@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +104,8 @@ class Tracker:
         parts = int(np.ceil(step / self._setup.settings.smoothing_half_width))
         self._stream = Stream(len(self._names), model.n_u, step, self._held + step, parts)
         self._cold = ColdStart(self._setup, seed, window, background=background)
-        self._changes = Changes(self._setup, step, false_alarms_per_hour, drift or {})
+        self._new_changes = partial(Changes, self._setup, step, false_alarms_per_hour, drift or {})
+        self._changes = self._new_changes()
         self._sensors = SensorWatch(self._setup)
         self._window: Window | None = None
         self._notes: list[str] = []
@@ -200,7 +202,7 @@ class Tracker:
 
     def _begin_anew(self) -> None:
         """Forget a fit that explains nothing, and identify the parameters from the rows that are held."""
-        self._window, self._start = None, None
+        self._window, self._start, self._changes = None, None, self._new_changes()
         self._cold.restart()
         self._notes.append("the parameters explain none of the motion, and are identified anew")
 
