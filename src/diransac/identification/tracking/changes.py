@@ -24,9 +24,8 @@ __all__ = ["Changes"]
 _MEMORY, _AS_EXPECTED = 60.0, 20.0
 # Change of a parameter that is expected of a machine, over the parameter.
 _USUAL_CHANGE = 1.0
-# Standard error of the value after a change, over the change, with which it is reported; standard errors within
-# which a parameter has returned to an earlier value.
-_DETERMINED, _RETURNED = 0.1, 3.0
+# Standard errors within which a parameter has returned to an earlier value.
+_RETURNED = 3.0
 # Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
 _REMEMBERED, _MOST_AGES = 32, 32
 # Kind of a change that goes on, in `ChangeTests`.
@@ -92,12 +91,15 @@ class Changes:
         """Test for changes, release a parameter that has changed, and report what is determined."""
         of_calm = with_forces(found, *self._usual_forces(window))
         tests = change_tests(of_calm, ages_of(len(window)))
-        self._full |= len(window) == window.most
         gain = self._gain(tests, self._scatter(tests.ages, len(window)), window).max()
-        if not self._full or gain < self._price(tests.ages):
-            self._learn(window, tests)
-        else:
+        is_full = len(window) == window.most
+        self._full |= is_full
+        if is_full:
+            self._learn_drift(window, tests)
+        if self._full and gain > self._price(tests.ages):
             self._decide(window, of_calm)
+        elif is_full:
+            self._learn_scatter(tests)
         self._report(window)
         self._follow_drift(window)
 
@@ -133,19 +135,19 @@ class Changes:
         """Places ``(A,)`` of ages in what is remembered: by powers of two; the last one is that of a whole window."""
         return np.where(ages == n, _MOST_AGES - 1, np.log2(ages).astype(np.int64))
 
-    def _learn(self, window: Window, tests: ChangeTests) -> None:
-        """Remember the scatter of the tests, and what they tell of the drift."""
-        is_full = len(window) == window.most
-        ages = slice(None if is_full else -1)
-        places, weight = self._places(tests.ages, len(window))[ages], 1.0 / tests.ages[None, ages, None]
-        seen = np.square(tests.ratio[:, ages]), tests.information[:, ages] > 0.0
+    def _learn_scatter(self, tests: ChangeTests) -> None:
+        """Remember the scatter of the tests of a full window."""
+        places = self._places(tests.ages, int(tests.ages[-1]))
+        seen = np.square(tests.ratio), tests.information > 0.0
         faded = np.exp(-self.step / _MEMORY)
         for sums, new in zip((self._squares, self._counts), seen, strict=True):
-            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + weight * new
-        if is_full:
-            T, information = self._duration(window), tests.information[0, -1].copy()
-            information[[x.index for x in self._pending]] = 0.0
-            self.drift.learn(window.fit.shared, tests.size[0, -1], information, T, self.step / T)
+            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + new / tests.ages[:, None]
+
+    def _learn_drift(self, window: Window, tests: ChangeTests) -> None:
+        """Remember how much a full window differs from what was known before it."""
+        T, information = self._duration(window), tests.information[0, -1].copy()
+        information[[x.index for x in self._pending]] = 0.0
+        self.drift.learn(window.fit.shared, tests.size[0, -1], information, T, self.step / T)
 
     def _gain(self, tests: ChangeTests, scatter: FloatArray, window: Window) -> FloatArray:
         """Logarithms ``(2, A, n)`` of the Bayes factors of the changes, as eq. (8) of `docs/method.md`."""
@@ -192,7 +194,7 @@ class Changes:
         for one in list(self._pending):
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
-            settled = abs(after - self._before[one.index]) < error < _DETERMINED * change
+            settled = abs(after - self._before[one.index]) < error
             if settled and change > significant * both:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
