@@ -23,6 +23,7 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
+from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
@@ -30,7 +31,6 @@ from diransac.identification.methods.lo_diransac.projection import ProjectedEsti
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-from diransac.identification.methods.lo_diransac.structural import possible_terms
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -44,7 +44,7 @@ from diransac.process import memory_kept, single_threaded
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
+    from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.parts import Change
     from diransac.identification.settings import Settings
@@ -204,11 +204,10 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset, rows_of_logs(intervals, motion))
-    parts, lacks = compared_parts(likeliest, result), None
-    if settings.suggestions and not likeliest.exact:
-        from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
-
-        lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
+    parts, candidates, lacks = compared_parts(likeliest, result), None, None
+    if settings.suggestions:
+        candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
+        lacks = None if likeliest.exact else missing_terms(candidates)
     ambiguity = _ambiguity(parts.changes, lacks, len(result.parameters))
     checks = (
         *_checks(settings, best),
@@ -216,7 +215,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *_checks_of_unmeasured(best),
         *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
-    found = _Found(dataset, best, result, ambiguity, lacks)
+    found = _Found(dataset, best, result, ambiguity, candidates, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     return _estimate(settings, found, end, checks)
@@ -287,14 +286,15 @@ def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
 class _Found:
     """Parts of an estimate.
 
-    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be; ``lacks``
-    is None where terms that the model lacks were not sought.
+    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be;
+    ``candidates`` is None where terms that the model lacks were not sought, ``lacks`` also where it is exact.
     """
 
     dataset: Dataset
     best: Searched
     result: ProjectedEstimate
     ambiguity: FloatArray
+    candidates: Candidates | None
     lacks: MissingTerms | None
 
     @property
@@ -312,8 +312,7 @@ class _Found:
 
 def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Finding, ...]) -> Estimate:
     dataset, best, result = found.dataset, found.best, found.result
-    intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
-    names = dataset.layout.names
+    intervals, names = best.likeliest.intervals, dataset.layout.names
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, best.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
@@ -342,9 +341,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if best.decided is None else best.decided.summary,
-        possible_terms=possible_terms(intervals, fit, result, covariance, settings.candidate_terms)
-        if settings.suggestions
-        else None,
+        possible_terms=possible_terms(found.candidates, result, covariance, names) if found.candidates else None,
         of_logs=best.decided.of_logs if best.decided else (),
     )
 
