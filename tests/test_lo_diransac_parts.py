@@ -15,7 +15,6 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
 from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
-from diransac.identification.methods.lo_diransac.missing_terms import short_windows
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
@@ -482,12 +481,6 @@ def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameter
     long = next(x for x in found if len(x.windows) < 0.15 * len(intervals))
     assert long.parameters == pytest.approx(TRUTH, rel=0.05)
     assert (np.abs(long.parameters - TRUTH) < 4.0 * np.sqrt(np.diag(long.covariance))).all()
-
-
-def test_terms_are_sought_in_windows_of_four_intervals_at_most():
-    """Windows never span two logs, whose first intervals are 0 and 20."""
-    assert short_windows(np.array([0, 16, 20, 36]), 38).tolist() == [0, 4, 8, 12, 16, 20, 24, 28, 32, 36]
-    assert short_windows(np.array([0, 2, 4, 5]), 7).tolist() == [0, 2, 4, 5]
 
 
 @pytest.mark.parametrize(("correlation", "least"), [(0.0, 0.91), (0.5, 0.89), (0.8, 0.87), (0.9, 0.85), (0.95, 0.8)])

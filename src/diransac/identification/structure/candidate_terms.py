@@ -102,11 +102,6 @@ class CandidateTerms:
     def __len__(self) -> int:
         return len(self.terms)
 
-    @property
-    def groups(self) -> IntArray:
-        """Number of the parameter of each term: Stribeck friction at several speeds has the same."""
-        return np.unique([x.parameter for x in self.terms], return_inverse=True)[1].astype(np.int64)
-
     @cached_property
     def _entries(self) -> tuple[ca.Function, IntArray, IntArray]:
         """Function of the terms' structurally nonzero entries; equation and term of each."""

@@ -65,9 +65,9 @@ _KEPT = 1e-3
 _EQUIVALENT = 1e-6
 # Draws of a motion, and as many per parameter and equation; the seed.
 _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
-# Factor of the prior of discrepancies that holds them at zero; part of the largest force that is none.
-_HELD, _NO_FORCE = 1e-3, 1e-9
-# Part of the information of an interval that is rounding.
+# Factor of the prior of discrepancies that holds them at zero.
+_HELD = 1e-3
+# Part of the information of an interval, and of the largest force, that is rounding.
 _ROUNDING = 1e-12
 _HUGE, _TINY = 1e9, 1e-300
 
@@ -95,6 +95,12 @@ class Candidates:
     regression: TermRegression
     forces: MeanForces
     inertia: FloatArray
+
+    @property
+    def tests(self) -> CandidateTests:
+        """Tests of the terms one by one, at the delays of the fit."""
+        alone = self.regression.of(range(len(self.library)))
+        return CandidateTests(self.library.terms, self.units, *alone.estimates(), alone.effects)
 
 
 @dataclass(frozen=True)
@@ -138,13 +144,13 @@ def candidates_of_fit(
     motion, r, W, M = residuals_of_motion(intervals, fit, p)
     candidates, largest = _library(intervals, motion, library), _largest_forces(intervals, fit, motion, r, W, M)
     weights = _weights_of_rows(intervals)
-    means = candidates.means(motion, weights, intervals.length)
+    means = np.where(counted[:, None, None], candidates.means(motion, weights, intervals.length), 0.0)
     relative = (np.sqrt(np.square(means).sum(axis=0) / counted.sum()) / (largest[:, None] + _TINY)).max(axis=0)
-    acting = np.isfinite(relative) & (relative > _NO_FORCE)
+    acting = np.isfinite(relative) & (relative > _ROUNDING)
     chosen = np.flatnonzero(acting & ~_replaceable(intervals, motion, candidates))
     means = means[:, :, chosen]
-    delays = slopes_of_delays(intervals, motion, p)
-    r, W, delays = (means_of_intervals(intervals, (x.T * weights).T) * intervals.length for x in (r, W, delays))
+    rows = (r, W, slopes_of_delays(intervals, motion, p))
+    r, W, delays = (_means(intervals, weights, x) for x in rows)
     inertia = np.where(counted[:, None, None], means_of_intervals(intervals, M), np.eye(len(largest)))
     accelerations = -np.linalg.solve(inertia, np.concatenate([means, delays], axis=2))
 
@@ -171,14 +177,13 @@ def missing_terms(found: Candidates) -> MissingTerms:
     -------
     MissingTerms
     """
-    terms, forces, n = found.library.terms, found.forces, found.forces.own.shape[2]
+    terms, forces = found.library.terms, found.forces
     beside_delays = found.regression
     for k in range(len(terms), found.regression.columns.shape[2]):
         beside_delays = beside_delays.beside(k)
     regression = beside_delays.of(range(len(terms)))
     chosen = select_terms(terms, found.units, regression, forces)
-    coefficients = forces.regression(chosen)[0]
-    changes, values = coefficients[:n] - forces.regression([])[0], coefficients[n:]
+    changes, values = forces.changes(chosen)
     suggestions = tuple(
         found.library.suggestion(k, float(value), regression.error(k, chosen), forces.explained(chosen[:i], k))
         for i, (k, value) in enumerate(zip(chosen, values, strict=True))
@@ -206,9 +211,7 @@ def possible_terms(
     -------
     tuple of PossibleTerm
     """
-    terms = found.library.terms
-    regression = found.regression.of(range(len(terms)))
-    tests = CandidateTests(terms, found.units, *regression.estimates(), regression.effects)
+    tests = found.tests
     weights, means, variances = weighted(tests)
     own = np.diag(covariance)
     own = np.where(np.isfinite(own), own, np.inf)
@@ -218,7 +221,7 @@ def possible_terms(
     kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
     return tuple(
         PossibleTerm(
-            (term := terms[k]).kind,
+            (term := tests.terms[k]).kind,
             term.place,
             term.formula,
             float(weights[k]),
@@ -244,6 +247,12 @@ def _weights_of_rows(intervals: ShootingIntervals) -> FloatArray:
     counted = intervals.counted.astype(float)
     counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
     return np.asarray(counted / np.repeat(counts, intervals.length))
+
+
+def _means(intervals: ShootingIntervals, weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Weighted means ``(W, ...)`` of rows; 0 in intervals without a row that counts."""
+    weighted = np.where(weights > 0.0, values.T * weights, 0.0).T
+    return np.asarray(weighted.reshape(len(intervals), -1, *values.shape[1:]).sum(axis=1))
 
 
 # ---------------------------------------------------------------------- what each term changes in a fit
@@ -290,7 +299,7 @@ def _of_measurements(H: FloatArray, gradient: FloatArray, moved: FloatArray) -> 
     values, vectors = np.linalg.eigh(H / (size[:, :, None] * size[:, None, :]))
     known = values > _ROUNDING * values[:, -1:]
     root = np.sqrt(np.where(known, values, 0.0))
-    columns = root[:, :, None] * (vectors.swapaxes(1, 2) @ (size[:, :, None] * moved))
+    columns = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2)) @ moved
     left = np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
     return np.concatenate([columns, left[:, :, None]], axis=2)
 

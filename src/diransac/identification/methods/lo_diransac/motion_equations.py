@@ -142,10 +142,11 @@ def slopes_of_delays(intervals: ShootingIntervals, motion: Sequence[FloatArray],
     (N, n_v, n_u) array
     """
     *state, inputs = motion[:4]
-    p, later = _row_parameters(intervals, parameters), intervals.later_inputs
-    changed = [inputs, *(inputs + later * one for one in np.eye(inputs.shape[1]))]
-    before, *after = (_residual_map(intervals.model)(*state, u, p)[0] for u in changed)
-    return np.stack([x - before for x in after], axis=2)
+    model, p, later = intervals.model, _row_parameters(intervals, parameters), intervals.later_inputs
+    before, found = _residual_map(model)(*state, inputs, p)[0], np.zeros((len(inputs), model.n_v, model.n_u))
+    for j, one in enumerate(np.eye(model.n_u)):
+        found[:, :, j] = _residual_map(model)(*state, inputs + later * one, p)[0] - before
+    return found
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:

@@ -188,21 +188,33 @@ class MeanForces:
     largest: FloatArray
     inertia: Callable[[FloatArray], FloatArray]
 
-    def regression(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Coefficients ``(m + c,)`` of own columns and terms, and mean squares ``(e,)`` of the force that is left.
-
-        Equations are weighted by the force that is left in them.
-        """
-        columns = np.concatenate([self.own, self.terms[:, :, list(chosen)]], axis=2)
-        size, left = np.sqrt(np.square(columns).sum(axis=(0, 1))), self.force
+    def coefficients(self, chosen: Sequence[int], left: FloatArray) -> FloatArray:
+        """Least-squares coefficients ``(m + c,)`` of own columns and terms; ``left (e,)`` is the weights' inverse."""
+        columns = self._columns(chosen) / (left[:, None] + _TINY)
+        columns = columns.reshape(self.force.size, -1)
+        size = np.linalg.norm(columns, axis=0)
         size[size == 0.0] = 1.0
-        columns, found = columns / size, size
+        return np.asarray(
+            np.linalg.lstsq(columns / size, -(self.force / (left + _TINY)).ravel(), rcond=_RANK)[0] / size
+        )
+
+    def left(self, chosen: Sequence[int]) -> FloatArray:
+        """RMS ``(e,)`` of the force that own columns and terms leave; equations are weighted by it."""
+        found = np.sqrt(np.square(self.force).mean(axis=0))
         for _ in range(_REWEIGHTED):
-            scale = np.maximum(np.sqrt(np.square(left).mean(axis=0)), _ROUNDING * self.largest) + _TINY
-            A, b = columns / scale[:, None], self.force / scale
-            found = np.linalg.lstsq(A.reshape(b.size, -1), -b.ravel(), rcond=_RANK)[0]
-            left = self.force + columns @ found
-        return found / size, np.square(left).mean(axis=0)
+            found = np.maximum(found, _ROUNDING * self.largest)
+            rest = self.force + self._columns(chosen) @ self.coefficients(chosen, found)
+            found = np.sqrt(np.square(rest).mean(axis=0))
+        return np.asarray(np.maximum(found, _ROUNDING * self.largest))
+
+    def _columns(self, chosen: Sequence[int]) -> FloatArray:
+        return np.concatenate([self.own, self.terms[:, :, list(chosen)]], axis=2)
+
+    def changes(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Changes ``(m,)`` of the coefficients of own columns with the terms, and coefficients ``(c,)`` of these."""
+        left, m = self.left(chosen), self.own.shape[2]
+        found = self.coefficients(chosen, left)
+        return found[:m] - self.coefficients([], left), found[m:]
 
     def explained(self, chosen: Sequence[int], k: int) -> float:
         """Fraction of the mean square force that term k explains after those chosen, in the equations where it acts.
@@ -211,10 +223,12 @@ class MeanForces:
         left counts over the geometric mean of the factors by which the inertia changes.
         """
         acts, m = self.terms[:, :, k].any(axis=0), self.own.shape[2]
-        (a, before), (b, after) = self.regression(chosen), self.regression([*chosen, k])
-        determinants = [np.linalg.slogdet(self.inertia(x[:m]))[1].mean() for x in (a, b)]
-        shrunk = np.exp(2.0 * (determinants[1] - determinants[0]) / self.force.shape[1])
-        return float(1.0 - (after[acts] / (before[acts] + _TINY)).mean() / (shrunk + _TINY))
+        before, after = self.left(chosen), self.left([*chosen, k])
+        own = [self.coefficients(*x)[:m] for x in ((chosen, before), ([*chosen, k], after))]
+        determinants = [np.linalg.slogdet(self.inertia(x))[1].mean() for x in own]
+        shrunk = np.exp((determinants[1] - determinants[0]) / len(before))
+        ratio = after[acts] / (before[acts] * shrunk + _TINY)
+        return float(1.0 - np.square(ratio).mean())
 
 
 def select_terms(
@@ -237,23 +251,30 @@ def select_terms(
     parameters = np.array([x.parameter for x in terms])
     least = _EVIDENCE + np.log(max(len(terms), 1))
     chosen, allowed = list[int](), np.ones(len(terms), bool)
+    tests = _tests(terms, units, regression)
     while allowed.any():
-        tests = CandidateTests(tuple(terms), units, *regression.estimates(), regression.effects)
-        odds = np.where(allowed, tests.log_odds(), -np.inf)
-        k = int(np.argmax(odds))
+        odds = tests.log_odds()
+        k = int(np.argmax(np.where(allowed, odds, -np.inf)))
         if odds[k] < least:
             break
         allowed[k] = False
-        if _is_supported(tests, forces, chosen, k, least):
+        if not _is_supported(tests, forces, chosen, k, least):
+            continue
+        beside = regression.beside(k)
+        then, others = _tests(terms, units, beside), parameters != parameters[k]
+        if not (others & (odds > odds[k] - _EVIDENCE) & (then.log_odds() <= 0.0)).any():
             chosen.append(k)
-            regression = regression.beside(k)
-            allowed &= parameters != parameters[k]
+            allowed, tests, regression = allowed & others, then, beside
     return chosen
+
+
+def _tests(terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression) -> CandidateTests:
+    return CandidateTests(tuple(terms), units, *regression.estimates(), regression.effects)
 
 
 def _is_supported(tests: CandidateTests, forces: MeanForces, chosen: Sequence[int], k: int, least: float) -> bool:
     """True if least squares on the fitted motion agrees that a term is there, possible and large."""
-    value = forces.regression([*chosen, k])[0][-1]
+    value = forces.changes([*chosen, k])[1][-1]
     low, high = tests.terms[k].bounds
     there = replace(tests, estimates=np.full(len(tests.terms), value)).log_odds()[k] > least
     large = abs(value) > _SMALLEST * tests.units[k] and forces.explained(chosen, k) > _SHARE
