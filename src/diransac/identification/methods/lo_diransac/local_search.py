@@ -22,6 +22,7 @@ from diransac.errors import TimeLimitError
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
@@ -205,13 +206,13 @@ class LocalSearch:
     def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         required = self._required(intervals)
-        flexible = self._from_hypothesis(self._likeliest(intervals, required))
+        flexible = self._accurate(self._from_hypothesis(self._likeliest(intervals, required)))
         yield flexible
-        best = self._simplest(flexible)
+        best = self._accurate(self._simplest(flexible))
         yield best
         named = [*required, *self._named(intervals)]
         if named:
-            best = self._simplified(self._moved(best, best.intervals.with_errors(named)))
+            best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
             yield best
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
@@ -221,7 +222,7 @@ class LocalSearch:
                 trial = found[-1].trial or trial
             if not found:
                 break
-            best = min(found, key=lambda x: x.cost)
+            best = self._accurate(min(found, key=lambda x: x.cost))
             yield best
 
     def _required(self, intervals: ShootingIntervals) -> list[ErrorKind]:
@@ -345,6 +346,17 @@ class LocalSearch:
         begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self.prior)
         return Explanation(refine(self.settings, intervals, begin, self.prior), exact=False)
 
+    def _accurate(self, found: Explanation) -> Explanation:
+        """The explanation with the fewest integration steps that it admits; fitted again if these are more."""
+        intervals, fit = found.intervals, found.refinement.fit
+        other = with_fewest_steps(intervals, fit, self.settings.substeps)
+        if other.substeps == intervals.substeps:
+            return found
+        again = with_residuals(other, fit)
+        if other.substeps > intervals.substeps:
+            return self._optimised(found, other, again)
+        return replace(found, refinement=replace(found.refinement, intervals=other, fit=again))
+
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""
         return found if found.exact else self._simplest(found)
@@ -391,7 +403,11 @@ class LocalSearch:
         return min(found, key=lambda x: x.cost, default=None)
 
     def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: float) -> Explanation | None:
-        """The exact model from a motion; None if simulations overflow from there."""
+        """The exact model from a motion, with all integration steps: it is one simulation of the whole log.
+
+        None if simulations overflow from there.
+        """
+        intervals = replace(intervals, substeps=self.settings.substeps)
         try:
             refined = refine_exact(self.settings, intervals, with_residuals(intervals, begin), self.prior, rival)
         except np.linalg.LinAlgError:

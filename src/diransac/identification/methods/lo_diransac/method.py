@@ -39,7 +39,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.refusal import check_signs
 from diransac.identification.structure.structural import check_structure, unidentifiable
-from diransac.process import memory_kept, single_threaded
+from diransac.process import memory_kept
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -101,8 +101,8 @@ class LoDiransac(LoDiransacSettings):
         Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
         is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
     substeps : int, optional
-        Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
-        samples or links are light.
+        Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
+        One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
     max_steps : int, optional
         Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional
@@ -163,7 +163,7 @@ class LoDiransac(LoDiransacSettings):
             The time limit was reached before the first local optimisation had converged.
         """
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
-        with single_threaded(), memory:  # matrices are small: more threads would only add waiting
+        with memory:
             return _fitted(self, dataset, int(seed), callback)
 
 
