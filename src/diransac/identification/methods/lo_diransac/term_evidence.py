@@ -262,7 +262,9 @@ def select_terms(
             continue
         beside = regression.beside(k)
         then, others = _tests(terms, units, beside), parameters != parameters[k]
-        if not (others & (odds > odds[k] - _EVIDENCE) & (then.log_odds() <= 0.0)).any():
+        # Another term that the log still determines, but does not show any more, explains the same.
+        replaced = np.isfinite(then.variances) & (then.log_odds() <= 0.0)
+        if not (others & replaced & (odds > odds[k] - _EVIDENCE)).any():
             chosen.append(k)
             allowed, tests, regression = allowed & others, then, beside
     return chosen
