@@ -16,7 +16,7 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
-from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
+from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
@@ -637,25 +637,6 @@ def test_spikes_of_a_force_sensor_are_left_out_and_those_that_acted_are_kept():
         noted.append(any("spikes" in note for note in result.notes))
         assert result.parameters["mass"] == pytest.approx(2.0, rel=0.02)
     assert noted == [True, False]
-
-
-# ---------------------------------------------------------------------- delays
-
-
-@pytest.mark.parametrize(
-    ("dt", "range_of_settings", "samples"),
-    [
-        (0.01, (-0.03, 0.08), (-3, 8)),
-        (300.0, (-0.03, 0.08), (-2, 2)),
-        (1e-6, (-0.03, 0.08), (-100, 100)),
-        (300.0, (0.0, 0.08), (0, 2)),
-        (0.01, (0.0, 0.0), (0, 0)),
-    ],
-)
-def test_range_of_delays_is_of_some_samples_whatever_the_sampling_time(dt, range_of_settings, samples):
-    signals, inputs = flight(MACHINES["planar-rotorcraft"], 50, 0.01)
-    search = LocalSearch(dr.LoDiransac(delay_range=range_of_settings), None, np.zeros((1, 3)), None, None)
-    assert search.delays(intervals_over(signals, inputs, dt=dt)) == samples
 
 
 def test_durations_have_a_fitting_unit():

@@ -86,9 +86,6 @@ class LoDiransac(LoDiransacSettings):
         Largest number of rows of each equation in a sample, over the number of parameters.
     n_screening_intervals, n_finalists : int, optional
         Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
-    delay_range : (float, float), optional
-        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation; where it is not
-        zero, 2 samples at least and 100 at most.
     input_delay, input_lag : bool, optional
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
         where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
