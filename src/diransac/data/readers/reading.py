@@ -132,6 +132,11 @@ class Reading:
         units = {n: unit for n, unit in table.units.items() if n in signals and abs(factors.get(n, 1.0)) == 1.0}
         return {"t": time, **{n: x * factors.get(n, 1.0) for n, x in signals.items()}}, units
 
+    def topics(self, like: Sequence[Mapping[str, Any]]) -> tuple[LogMapping | None, dict[str, str]]:
+        """Mapping, and new names by ``topic.field``, of a recording."""
+        earlier = Reading.of(like)
+        return self._chosen("mapping", earlier), {**earlier.rename, **self.rename}
+
     def _table(
         self,
         opened: Table | Recording,
