@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -164,16 +164,16 @@ class Pipe:
 
     Parameters
     ----------
-    stream : binary stream
-        With a file descriptor.
+    stream : buffered binary stream
+        Whose ``read1`` returns what is there.
     """
 
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._descriptor, self.ended = stream.fileno(), False
+    def __init__(self, stream: Any) -> None:
+        self._stream, self.ended = stream, False
 
     def new(self) -> tuple[bytes, str]:
         """As `Bytes.new`."""
-        data = os.read(self._descriptor, _BLOCK)
+        data: bytes = self._stream.read1(_BLOCK)
         self.ended = not data
         return data, ""
 
