@@ -15,7 +15,7 @@ from diransac.cli import screen
 from diransac.cli.arguments import fixed_parameters, model_file, preparation_of, start_values
 from diransac.cli.flight_options import FlightPicture
 from diransac.cli.group import grouped
-from diransac.cli.options import LogFile, ModelName, Preparation, Report, output_or_stdout
+from diransac.cli.options import JsonFlag, LogFile, ModelName, Preparation, Report, output_or_stdout
 from diransac.cli.outputs import PAGE, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.tracking import Summary, TrackTable, as_line, followed, to_dict, tracked
@@ -103,8 +103,11 @@ def _track(
     json_lines: Annotated[bool, typer.Option("--jsonl", help="Print a JSON object for each estimate.")] = False,
     plot: FlightPicture = None,
     report: Report = None,
+    as_json: JsonFlag = False,
 ) -> None:
     """Track the parameters of a machine while it runs, with their intervals and changes."""
+    if as_json and json_lines:
+        raise typer.BadParameter("--json and --jsonl both write to stdout; give one")
     _check(file, output, report, follow=follow, idle=idle, json_lines=json_lines)
     read = [None if file == STDOUT else file, model_file(model), options.start_file()]
     checked([output, plot, report], read)
@@ -124,7 +127,7 @@ def _track(
             shown.run(estimates, table)
         _finish(history, picture if plot else None, page if report else None)
         if not json_lines:
-            screen.show(Summary(history, findings), as_json=False)
+            screen.show(Summary(history, findings), as_json)
 
 
 def _check(
