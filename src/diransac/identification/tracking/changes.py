@@ -1,37 +1,195 @@
-"""Changes of the parameters while a machine runs."""
+"""Changes of the parameters while a machine runs: when one is declared, what follows, and when it is reported."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
-from diransac.arrays import FloatArray
+import numpy as np
+
+from diransac.arrays import FloatArray, IntArray
+from diransac.identification.tracking.drift import Drift
+from diransac.identification.tracking.estimates import Change
+from diransac.identification.tracking.forces import gain_of_forces, with_forces
+from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests
 
 if TYPE_CHECKING:
-    from diransac.identification.tracking.estimates import Change
     from diransac.identification.tracking.setup import Setup
     from diransac.identification.tracking.window import Linearization, Window
 
 __all__ = ["Changes"]
 
+# Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
+_MEMORY, _AS_EXPECTED = 60.0, 20.0
+# Change of a parameter that is expected of a machine, over the parameter.
+_USUAL_CHANGE = 1.0
+# Standard error of the value after a change, over the change, with which it is reported; standard errors within
+# which a parameter has returned to an earlier value.
+_DETERMINED, _RETURNED = 0.2, 3.0
+# Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
+_REMEMBERED, _MOST_AGES = 32, 32
+# Evidence, nats, by which a ramp must be likelier than a step.
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A change that is not yet determined well enough to be reported."""
+
+    index: int
+    time: float
+    before: float
+    before_error: float
+
 
 class Changes:
-    """Tests of steps and drifts of the parameters."""
+    """Tests of changes, the drift of parameters, and the honesty of their standard errors.
+
+    Parameters
+    ----------
+    setup : Setup
+    step : float
+        Time between estimates, s.
+    false_alarms_per_hour : float
+    drift : mapping of str to float
+        As of `Tracker`.
+    """
 
     def __init__(self, setup: Setup, step: float, false_alarms_per_hour: float, drift: Mapping[str, float]) -> None:
-        self.setup = setup
+        self.names = tuple(setup.model.parameters)
+        self.step, self.false_alarms = step, false_alarms_per_hour
+        self.drift = Drift(self.names, drift)
+        shape = (2, _MOST_AGES, len(self.names))
+        self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
+        self._usual: FloatArray | None = None
+        self._pending: list[_Pending] = []
+        self._reported: list[Change] = []
+        self._new: list[Change] = []
 
     def before_step(self, window: Window) -> None:
-        """Let parameters drift."""
+        """Let the parameters drift for a step, before the window."""
+        window.diffuse(np.sqrt(self.drift.rate * self.step))
 
     def after_step(self, window: Window, found: Linearization) -> None:
-        """Test for steps."""
+        """Test for changes, release a parameter that has changed, and report what is determined."""
+        of_calm = with_forces(found, *self._usual_forces(window))
+        tests = change_tests(of_calm, ages_of(len(window)))
+        gain = self._gain(tests, self._scatter(tests), found.fit.shared)
+        price = self._price(tests.ages)
+        if gain.max() > price:
+            age = int(tests.ages[np.unravel_index(np.argmax(gain), gain.shape)[1]])
+            if gain.max() - gain_of_forces(of_calm, age) > price:
+                self._declare(window, of_calm, int(np.unravel_index(np.argmax(gain), gain.shape)[2]))
+        else:
+            self._learn(window, tests)
+        self._report(window)
+
+    def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
+        """Size and correlation ``(n_v,)`` of the unmodelled accelerations from before the window.
+
+        They follow those of the fit with a delay of a window, so that a change which unmodelled accelerations seem to
+        explain is tested against those that the machine usually has.
+        """
+        now = np.stack([np.log(window.fit.tau), window.fit.rho])
+        self._usual = now if self._usual is None else self._usual
+        self._usual = self._usual + min(1.0, self.step / self._duration(window)) * (now - self._usual)
+        return np.exp(self._usual[0]), self._usual[1]
+
+    def _duration(self, window: Window) -> float:
+        """Duration of the window, s."""
+        return len(window) * window.length * window.stream.dt
+
+    def _price(self, ages: IntArray) -> float:
+        """Evidence, nats, that a change must gain: the logarithm of the number of tests between two false alarms.
+
+        Of one age, as many tests are independent as fit into an hour without overlapping.
+        """
+        per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
+        return float(np.log(per_hour / self.false_alarms))
+
+    def _scatter(self, tests: ChangeTests) -> FloatArray:
+        """Variance ``(2, A, n)`` of the ratios of the tests that is remembered; 1 at least."""
+        places = self._places(tests)
+        return np.asarray(np.maximum(self._squares[:, places] / self._counts[:, places], 1.0))
+
+    def _places(self, tests: ChangeTests) -> IntArray:
+        """Places ``(A,)`` of the ages in what is remembered; the last one is that of the whole window."""
+        return np.r_[0 : len(tests.ages) - 1, _MOST_AGES - 1]
+
+    def _learn(self, window: Window, tests: ChangeTests) -> None:
+        """Remember the scatter of the tests, and what they tell of the drift."""
+        if self._pending or len(window) < window.most:
+            return
+        faded, weight = np.exp(-self.step / _MEMORY), 1.0 / tests.ages[None, :, None]
+        seen = weight * np.square(tests.ratio), weight * (tests.information > 0.0)
+        places = self._places(tests)
+        for sums, new in zip((self._squares, self._counts), seen, strict=True):
+            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + new
+        T = self._duration(window)
+        size, information = tests.size[0, -1], tests.information[0, -1]
+        self.drift.learn(window.fit.shared, size, information, T, self.step / T)
+
+    def _gain(self, tests: ChangeTests, scatter: FloatArray, values: FloatArray) -> FloatArray:
+        """Logarithms ``(2, A, n)`` of the Bayes factors of the changes, as eq. (8) of `docs/method.md`."""
+        information = tests.information / scatter
+        prior = np.square(_USUAL_CHANGE * values) * information
+        ratio = np.square(tests.size) * information
+        return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
+
+    # ------------------------------------------------------------------ a change
+
+    def _declare(self, window: Window, found: Linearization, index: int) -> None:
+        """Release a parameter from the most probable time of its change on, unless that is a drift."""
+        tests = change_tests(found, np.arange(1, len(window) + 1))
+        gain = self._gain(tests, np.ones_like(tests.size), found.fit.shared)[:, :, index]
+        ramp, step = gain.max(axis=1)[::-1]
+        at = int(np.argmax(gain[0]))
+        if ramp > step + _CLEARLY:
+            self._learn(window, change_tests(found, ages_of(len(window))))
+            return
+        shift = tests.size[0, at, index]
+        before = found.fit.shared + tests.shift[0, at, index] * shift
+        first = len(window) - int(tests.ages[at])
+        time = float(window.times[first])
+        value, error = window.release(first, index, before, shift)
+        self._pending = [x for x in self._pending if x.index != index]
+        self._pending.append(_Pending(index, time, value, error))
+
+    def _report(self, window: Window) -> None:
+        """Report the changes that are determined, and forget those that have turned out to be none."""
+        errors, now = np.sqrt(np.diag(self.covariance(window))), window.times[-1] + window.length * window.stream.dt
+        significant = np.sqrt(2.0 * self._price(ages_of(len(window))))
+        for one in list(self._pending):
+            after, error = float(window.fit.shared[one.index]), float(errors[one.index])
+            change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
+            if change > significant * both and error < _DETERMINED * change:
+                self._pending.remove(one)
+                self._say(one, after, error, float(now))
+            elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
+                self._pending.remove(one)
+
+    def _say(self, one: _Pending, after: float, error: float, now: float) -> None:
+        """Report a change."""
+        name = self.names[one.index]
+        earlier = [x for x in self._reported if x.parameter == name]
+        back = any(abs(after - x.before) < _RETURNED * np.hypot(error, x.before_error) for x in earlier)
+        kind: Literal["step", "return"] = "return" if back else "step"
+        change = Change(one.time, name, one.before, after, kind, now, one.before_error, error)
+        self._reported = [*self._reported, change][-_REMEMBERED:]
+        self._new.append(change)
 
     def covariance(self, window: Window) -> FloatArray:
-        """Covariance of the parameters at the end of the window."""
+        """Covariance of the parameters at the end of the window.
+
+        It includes their drift during the window, and is larger where windows scatter more than their covariances.
+        """
         assert window.last is not None
-        return window.last.solved.var_p
+        drift = np.diag(self.drift.rate * self._duration(window) / 3.0)
+        more = np.sqrt(np.maximum(self._squares[0, -1] / self._counts[0, -1], 1.0))
+        return np.asarray((window.last.solved.var_p + drift) * np.outer(more, more))
 
     def taken(self) -> tuple[Change, ...]:
         """Changes since the last call."""
-        return ()
+        new, self._new = tuple(self._new), []
+        return new

@@ -26,8 +26,6 @@ __all__ = ["Start", "begun", "smoothed_motion"]
 
 # Prior standard deviation of a parameter of which only a rough value is known, over the value.
 _ROUGH = 10.0
-# Smallest unmodelled accelerations, over their prior size: those of a model that is exact, as in `refine_exact`.
-_EXACT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def smoothed_motion(setup: Setup, stream: Stream, first: int, n_rows: int) -> Mo
     return Motion(motion.signals[at], motion.spread)
 
 
-def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start) -> Window:
+def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: int) -> Window:
     """Window of the first n intervals, fitted from the parameters of a start.
 
     Parameters
@@ -91,6 +89,8 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start) -> Win
     n : int
         Number of intervals.
     given : Start
+    most : int
+        Number of intervals of the window once it is full.
 
     Returns
     -------
@@ -116,7 +116,10 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start) -> Win
     with_prior = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
     prior = make_prior(setup.settings, with_prior, motion, np.full(len(p), np.inf))
     fit = refine(setup.settings, with_prior, start(setup.settings, with_prior, motion, p, prior), prior).fit
-    return Window(setup, stream, first, _with_boundary(fit, p, covariance), _EXACT * prior.tau)
+    n_x = fit.x.shape[1]
+    return Window(
+        setup, stream, first, _with_boundary(fit, p, covariance), motion.spread[n_x : n_x + setup.model.n_v], most
+    )
 
 
 def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:

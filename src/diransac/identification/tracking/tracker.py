@@ -179,7 +179,8 @@ class Tracker:
         if n * stream.length * stream.dt < _FIRST - 1e-9 or end < self._retry:
             return
         try:
-            self._window = begun(self._setup, stream, first, n * self._setup.parts, self._start)
+            parts = self._setup.parts
+            self._window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
         except DiransacError:
             self._retry = end + stream.length
             return
@@ -192,7 +193,7 @@ class Tracker:
         n = self._joining(end) if new else parts
         if n is None or end < window.end + n * window.length:
             return False
-        excess = len(window) + n - self._steps * parts
+        excess = len(window) + n - window.most
         if excess > 0:
             window.leave(min(excess, len(window) - 1))
             stream.drop(window.first // stream.length * stream.length - stream.first)

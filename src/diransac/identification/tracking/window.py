@@ -9,14 +9,15 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
-    ProcessSums,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
 )
 from diransac.identification.tracking.marginal import marginal
+from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
@@ -32,6 +33,10 @@ _MOST_STEPS, _SETTLED = 3, 0.1
 # Time over which noise and unmodelled accelerations are remembered after the window, s: a minute of a sensor at 1 Hz
 # still gives its noise to 10 %.
 _MEMORY = 60.0
+# Unmodelled accelerations of a model that is exact, over the accelerations: nothing that a sensor shows.
+_EXACT = 3e-5
+# Standard deviation of a parameter of which nothing is known after a change, over the parameter.
+_FREE = 10.0
 
 
 @dataclass(frozen=True)
@@ -64,18 +69,21 @@ class Window:
         First row of the window.
     fit : Fit
         Of its intervals.
-    least : (n_v,) array
-        Smallest size of the unmodelled accelerations.
+    spread : (n_v,) array
+        Of the accelerations.
+    most : int
+        Number of intervals of the window once it is full.
     """
 
-    def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, least: FloatArray) -> None:
-        self.setup, self.stream, self.first, self.fit, self.least = setup, stream, first, fit, least
+    def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
+        self.most = most
+        self.setup, self.stream, self.first, self.fit, self.spread = setup, stream, first, fit, spread
+        self.least = _EXACT * spread
         n = len(fit.x)
         self.length = stream.length // setup.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
         none = np.zeros_like(fit.noise.sigma)
         self.noise = NoiseSums(none, none, none)
-        self.process = ProcessSums(*np.zeros((4, len(fit.tau))))
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
         self.damping = 0.0
         self.last: Linearization | None = None
@@ -134,14 +142,70 @@ class Window:
             root[changing, np.arange(len(changing))] = std[changing]
             self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
 
+    def release(self, first: int, index: int, before: FloatArray, change: float) -> tuple[float, float]:
+        """Begin the window anew where a parameter has changed, of which nothing is known from then on.
+
+        Parameters
+        ----------
+        first : int
+            Interval with which the change begins.
+        index : int
+            Of the parameter.
+        before : (n_p,) array
+            Parameters before the change.
+        change : float
+            Its size.
+
+        Returns
+        -------
+        float, float
+            The parameter before the change, and its standard error.
+        """
+        whole, rows = self.fit, first * self.length
+        fit, value, error = self._fit_before(first, index, before)
+        shared = fit.shared.copy()
+        shared[index] += change
+        assert fit.boundary is not None
+        free = np.zeros((len(shared), 1))
+        free[index] = _FREE * max(abs(shared[index]), abs(change))
+        boundary = fit.boundary.diffused(free)
+        self.first, self.times = self.first + rows, self.times[first:]
+        self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
+        self.fit = with_residuals(self.intervals(), self.fit)
+        self.damping = 0.0
+        self.optimise()
+        return value, error
+
+    def _fit_before(self, first: int, index: int, before: FloatArray) -> tuple[Fit, float, float]:
+        """The fit of the intervals before one of the window, as a boundary of that, with a parameter and its error."""
+        if not first:
+            boundary = self.fit.boundary
+            assert boundary is not None
+            mean, variance = boundary.marginal_of(len(boundary.point) - len(before) + index)
+            shared = before.copy()
+            shared[index] = mean
+            return replace(self.fit, shared=shared), mean, float(np.sqrt(variance))
+        whole = self.intervals()
+        is_before = np.arange(len(whole.measured)) < first * self.length
+        intervals = replace(whole, sampled=whole.sampled & is_before[:, None])
+        fit, damping = with_residuals(intervals, replace(self.fit, shared=before)), 0.0
+        for _ in range(_MOST_STEPS):
+            at = linearized(intervals, fit)
+            taken = gauss_newton_step(intervals, fit, at, damping)
+            fit, damping = taken.fit, taken.damping
+        boundary = marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
+        error = float(np.sqrt(taken.solved.var_p[index, index]))
+        return replace(fit, boundary=boundary), float(fit.shared[index]), error
+
     # ------------------------------------------------------------------ the fit
 
     def optimise(self) -> Linearization:
         """Steps of the fit and of its scales from the state of the window; the first linearisation."""
         intervals = self.intervals()
+        weights = weights_of_free_motion(self) if is_surprised(self) else None
         first: Linearization | None = None
         for _ in range(_MOST_STEPS):
-            at = linearized(intervals, self.fit)
+            at = linearized(intervals, self.fit, weights)
             before = self.fit
             taken = gauss_newton_step(intervals, before, at, self.damping)
             self.last = Linearization(intervals, before, at.of_fit, taken.solved)
@@ -158,10 +222,11 @@ class Window:
         """The fit with its scales, from the window and what is remembered."""
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
-        process = process_sums(intervals, fit, solved).total().plus(self.process)
-        tau = np.maximum(process.most_probable_size(self.least, fit.tau), self.least)
+        process = process_sums(intervals, fit, solved).total()
+        tau = np.maximum(process.likeliest_size(fit.tau), self.least)
+        rho = np.where(tau > self.least, process.correlation(self.least), 0.0)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
-        return replace(fit, noise=noise, tau=tau, rho=process.correlation(self.least), continuity_std=continuity)
+        return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
 
     def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
@@ -171,8 +236,6 @@ class Window:
         faded = self.kept**n
         sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         self.noise = sums.plus(self.noise, faded)
-        process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
-        self.process = process.plus(self.process, faded)
 
     # ------------------------------------------------------------------ what it tells
 

@@ -28,6 +28,8 @@ __all__ = ["BoundaryPrior"]
 
 # Part of the largest eigenvalue, of information that is scaled to a diagonal of one, that rounding leaves of none.
 _ROUNDING = 1e-14
+# Part of an unknown that the information must determine.
+_SURE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,15 @@ class BoundaryPrior:
     def information(self) -> FloatArray:
         """Information matrix ``(n, n)``."""
         return self.root.T @ self.root
+
+    def marginal_of(self, index: int) -> tuple[float, float]:
+        """Mean and variance of one unknown; the variance is infinite where nothing is known of it."""
+        size = np.linalg.norm(self.root, axis=0)
+        scale = 1.0 / np.where(size > 0.0, size, 1.0)
+        inverse = scale[:, None] * np.linalg.pinv(self.root * scale)
+        known = float(inverse[index] @ self.root[:, index])
+        variance = float(np.square(inverse[index]).sum()) if known > 1.0 - _SURE else np.inf
+        return float(self.point[index] + inverse[index] @ self.offset), variance
 
     def right(self, fit: Fit) -> FloatArray:
         """Minus half the gradient of twice the cost, ``(n,)``, at a fit."""

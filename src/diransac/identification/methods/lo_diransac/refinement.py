@@ -350,19 +350,9 @@ def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: Lo
     return bool(losses[-1] - rival > intervals.known.sum() + left * best)
 
 
-def linearized(intervals: ShootingIntervals, fit: Fit) -> JointEquations:
-    """Normal equations at a fit, with its own weights.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-
-    Returns
-    -------
-    JointEquations
-    """
-    return JointEquations.of(intervals, fit, intervals.all_errors.kinds)
+def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> JointEquations:
+    """Normal equations at a fit, with its own weights unless there are others; see `JointEquations.of`."""
+    return JointEquations.of(intervals, fit, intervals.all_errors.kinds, weights)
 
 
 def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> float:

@@ -33,6 +33,7 @@ _CONTINUITY = 0.03
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
+_CHANCE, _TINY = 2.0, 1e-300
 # Correlation of unmodelled accelerations from interval to interval at most.
 _MOST_ALIKE = 0.98
 
@@ -49,12 +50,21 @@ class ProcessSums:
         Number of innovations that the measurements determine.
     product, size : (n_v,) or (W, n_v) array
         Products and mean squares of the accelerations of an interval and the one before.
+    count : (n_v,) or (W, n_v) array
+        Number of innovations.
+    weight, surplus : (n_v,) or (W, n_v) array
+        Inverse squares of the variances of the innovations that the measurements of an interval alone give, and with
+        these weights, squares of these innovations beyond what noise gives them.
     """
 
     squares: FloatArray
     determined: FloatArray
     product: FloatArray
     size: FloatArray
+    count: FloatArray
+    weight: FloatArray
+    surplus: FloatArray
+    cross: FloatArray
 
     def total(self) -> ProcessSums:
         """Sums over the intervals."""
@@ -69,12 +79,31 @@ class ProcessSums:
         return ProcessSums(*(x + weight * y for x, y in zip(self._all, other._all, strict=True)))
 
     @property
-    def _all(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return self.squares, self.determined, self.product, self.size
+    def _all(self) -> tuple[FloatArray, ...]:
+        return self.squares, self.determined, self.product, self.size, self.count, self.weight, self.surplus, self.cross
 
     def most_probable_size(self, expected: FloatArray, now: FloatArray) -> FloatArray:
         """Size ``(n_v,)`` of the innovations; see `most_probable_size`."""
         return most_probable_size(self.squares, self.determined.clip(0.0), expected, now)
+
+    def likeliest_size(self, now: FloatArray) -> FloatArray:
+        """Size ``(n_v,)`` of the innovations without a prior, 0 as long as noise may be all of it.
+
+        The measurements of an interval alone give its innovation with a variance v.  The size is that of all of these
+        innovations beyond their variances, each weighted by the inverse square of ``v + tau^2``; of what noise hides,
+        it must exceed two standard errors.
+
+        Parameters
+        ----------
+        now : (n_v,) array
+            Present size, from which it changes by no more than a scale does in a step.
+        """
+        weight = np.maximum(self.weight, _TINY)
+        hidden = 1.0 - np.square(now) * np.sqrt(weight / np.maximum(self.count, 1.0))
+        alike = (self.cross / weight).clip(0.0, _MOST_ALIKE)
+        chance = np.sqrt(2.0 / weight * (1.0 + alike) / (1.0 - alike))
+        size = self.surplus / weight - _CHANCE * hidden.clip(0.0) * chance
+        return np.asarray(np.clip(np.sqrt(size.clip(0.0)), SHRINK * now, now / SHRINK))
 
     def correlation(self, expected: FloatArray) -> FloatArray:
         """Correlation ``(n_v,)`` from interval to interval; accelerations of an expected size have none beforehand."""
@@ -105,8 +134,19 @@ def process_sums(intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Pr
     product, size = np.zeros_like(second), np.zeros_like(second)
     product[1:] = np.where(linked, fit.d[1:] * fit.d[:-1] + common, 0.0)
     size[1:] = np.where(linked, 0.5 * (second[1:] + second[:-1]), 0.0)
-    squares = np.square(fit.tau) * np.square(innovations(intervals, fit))
-    return ProcessSums(squares, determined, product, size)
+    tau2, squares, share = np.square(fit.tau), np.square(innovations(intervals, fit)), determined.clip(0.0)
+    cross = np.zeros_like(second)
+    cross[1:] = np.where(linked, np.square(common / np.square(tau2)), 0.0)
+    return ProcessSums(
+        squares=tau2 * squares,
+        determined=determined,
+        product=product,
+        size=size,
+        count=np.isfinite(std).astype(float),
+        weight=np.square(share / tau2),
+        surplus=(squares - share + np.square(share)) / tau2,
+        cross=cross,
+    )
 
 
 def most_probable_size(

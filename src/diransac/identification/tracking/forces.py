@@ -1,0 +1,101 @@
+"""Other sizes of the unmodelled accelerations of a linearised window: what they change, and what they gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.tracking.window import Linearization
+
+__all__ = ["gain_of_forces", "with_forces"]
+
+# Factors by which unmodelled accelerations may be larger from a time on, and their correlation then.
+_FACTORS, _GUST = 4.0 ** np.arange(1, 6), 0.9
+
+
+class _Terms(NamedTuple):
+    """Terms of the innovations in the normal equations: diagonals, those below, right-hand side, cost, log density."""
+
+    diagonal: FloatArray
+    below: FloatArray
+    right: FloatArray
+    cost: float
+    log_std: float
+
+
+def _terms(intervals: ShootingIntervals, fit: Fit) -> _Terms:
+    std = innovation_std(intervals, fit)
+    own, rho = np.square(1.0 / std), np.where(intervals.following[1:, None], fit.rho, 0.0)
+    scaled = innovations(intervals, fit)
+    deviation = scaled / std
+    diagonal, right = own.copy(), -deviation
+    diagonal[:-1] += np.square(rho) * own[1:]
+    right[:-1] += rho * deviation[1:]
+    return _Terms(
+        diagonal, -rho * own[1:], right, float(np.square(scaled).sum()), float(np.log(std[np.isfinite(std)]).sum())
+    )
+
+
+def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linearization:
+    """The linearised window with other scales of the unmodelled accelerations.
+
+    Parameters
+    ----------
+    found : Linearization
+    tau : (n_v,) or (W, n_v) array
+        Their size.
+    rho : (n_v,) array
+        Their correlation from interval to interval.
+
+    Returns
+    -------
+    Linearization
+        Its solution is still that of the former scales.
+    """
+    at, fit = found.at, replace(found.fit, tau=tau, rho=rho)
+    old, new, n_x = _terms(found.intervals, found.fit), _terms(found.intervals, fit), fit.x.shape[1]
+    diagonal, below, right = at.system.diagonal.copy(), at.system.below.copy(), at.right_z.copy()
+    np.einsum("wii->wi", diagonal)[:, n_x:] += new.diagonal - old.diagonal
+    np.einsum("wii->wi", below)[:, n_x:] += new.below - old.below
+    right[:, n_x:] += new.right - old.right
+    system = replace(at.system, diagonal=diagonal, below=below)
+    return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
+
+
+def gain_of_forces(found: Linearization, age: int) -> float:
+    """Evidence, nats, that larger unmodelled accelerations of the last intervals gain.
+
+    Parameters
+    ----------
+    found : Linearization
+    age : int
+        Number of these intervals.
+
+    Returns
+    -------
+    float
+        The largest over sizes; 0 where none gains.
+    """
+    fit, before = found.fit, _evidence(found)
+    recent = (np.arange(len(fit.x)) >= len(fit.x) - age)[:, None]
+    gains = [0.0]
+    for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
+        for factor in _FACTORS:
+            gains.append(_evidence(with_forces(found, fit.tau * np.where(recent, factor, 1.0), rho)) - before)
+    return max(gains)
+
+
+def _evidence(found: Linearization) -> float:
+    """Logarithm of the evidence of a linearised window, up to terms that do not depend on unmodelled accelerations."""
+    at, terms = found.at, _terms(found.intervals, found.fit)
+    solved = at.system.solve(at.right_z, at.right_s)
+    gained = (at.right_z * solved.step_z).sum() + at.right_s @ solved.step_p
+    return float(0.5 * (gained - terms.cost - solved.log_det) - terms.log_std)
