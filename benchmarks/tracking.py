@@ -51,7 +51,7 @@ BEGINNING, SETTLING = 10.0, 5.0
 """Seconds at the beginning, and after a step, in which errors are not counted."""
 NEAR = 0.1
 """Relative distance of an estimate that has arrived at the new value."""
-UNCHANGED = 0.01
+UNCHANGED = 1e-6
 """Relative difference of a parameter that has not changed."""
 HOUR = 3600.0
 WARM = 600.0
