@@ -30,7 +30,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -164,9 +164,15 @@ def _false_reports(flight: Flight, reports: Sequence[tuple[float, str, float]]) 
 # ---------------------------------------------------------------------- rows
 
 
+@lru_cache(maxsize=1)
+def flown(machine: str, scenario: str, seed: int) -> Flight:
+    """The flight, which methods share."""
+    return MACHINES[machine].fly(SCENARIOS[scenario], seed)
+
+
 def row_of(machine: str, scenario: str, method: str, seed: int) -> Row:
     """What is measured of one flight and method; of one that fails, its message."""
-    flight = MACHINES[machine].fly(SCENARIOS[scenario], seed)
+    flight = flown(machine, scenario, seed)
     row = {"machine": machine, "scenario": scenario, "method": method, "seed": seed}
     try:
         moments = list(methods_of(machine)[method](flight, STEP))
