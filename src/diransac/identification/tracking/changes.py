@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.identification.tracking.drift import Drift
 from diransac.identification.tracking.estimates import Change
-from diransac.identification.tracking.forces import gain_of_forces, with_forces
-from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests
+from diransac.identification.tracking.forces import explanations_by_forces, with_forces
+from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
 
 if TYPE_CHECKING:
     from diransac.identification.tracking.setup import Setup
@@ -26,11 +26,11 @@ _MEMORY, _AS_EXPECTED = 60.0, 20.0
 _USUAL_CHANGE = 1.0
 # Standard error of the value after a change, over the change, with which it is reported; standard errors within
 # which a parameter has returned to an earlier value.
-_DETERMINED, _RETURNED = 0.2, 3.0
+_DETERMINED, _RETURNED = 0.1, 3.0
 # Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
 _REMEMBERED, _MOST_AGES = 32, 32
-# Evidence, nats, by which a ramp must be likelier than a step.
-_CLEARLY = 3.0
+# Kind of a change that goes on, in `ChangeTests`.
+_RAMP = 1
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,18 @@ class _Pending:
     time: float
     before: float
     before_error: float
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """A change that explains a window: its evidence, kind, age, parameter, size, and the shift of all before it."""
+
+    evidence: float
+    kind: int = 0
+    age: int = 0
+    index: int = 0
+    size: float = 0.0
+    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 class Changes:
@@ -63,6 +75,8 @@ class Changes:
         shape = (2, _MOST_AGES, len(self.names))
         self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
         self._usual: FloatArray | None = None
+        self._full = False
+        self._before = np.full(len(self.names), np.inf)
         self._pending: list[_Pending] = []
         self._reported: list[Change] = []
         self._new: list[Change] = []
@@ -75,14 +89,11 @@ class Changes:
         """Test for changes, release a parameter that has changed, and report what is determined."""
         of_calm = with_forces(found, *self._usual_forces(window))
         tests = change_tests(of_calm, ages_of(len(window)))
-        gain = self._gain(tests, self._scatter(tests), found.fit.shared)
-        price = self._price(tests.ages)
-        if gain.max() > price:
-            age = int(tests.ages[np.unravel_index(np.argmax(gain), gain.shape)[1]])
-            if gain.max() - gain_of_forces(of_calm, age) > price:
-                self._declare(window, of_calm, int(np.unravel_index(np.argmax(gain), gain.shape)[2]))
-        else:
+        self._full |= len(window) == window.most
+        if not self._full or self._gain(tests, self._scatter(tests), found.fit.shared).max() < self._price(tests.ages):
             self._learn(window, tests)
+        else:
+            self._decide(window, of_calm, tests)
         self._report(window)
 
     def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
@@ -115,7 +126,7 @@ class Changes:
 
     def _places(self, tests: ChangeTests) -> IntArray:
         """Places ``(A,)`` of the ages in what is remembered; the last one is that of the whole window."""
-        return np.r_[0 : len(tests.ages) - 1, _MOST_AGES - 1]
+        return np.array([*range(len(tests.ages) - 1), _MOST_AGES - 1])
 
     def _learn(self, window: Window, tests: ChangeTests) -> None:
         """Remember the scatter of the tests, and what they tell of the drift."""
@@ -139,22 +150,25 @@ class Changes:
 
     # ------------------------------------------------------------------ a change
 
-    def _declare(self, window: Window, found: Linearization, index: int) -> None:
-        """Release a parameter from the most probable time of its change on, unless that is a drift."""
-        tests = change_tests(found, np.arange(1, len(window) + 1))
-        gain = self._gain(tests, np.ones_like(tests.size), found.fit.shared)[:, :, index]
-        ramp, step = gain.max(axis=1)[::-1]
-        at = int(np.argmax(gain[0]))
-        if ramp > step + _CLEARLY:
-            self._learn(window, change_tests(found, ages_of(len(window))))
+    def _decide(self, window: Window, found: Linearization, tests: ChangeTests) -> None:
+        """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
+        best, without = _Explanation(-np.inf), -np.inf
+        for scaled, evidence in explanations_by_forces(found):
+            without = max(without, evidence)
+            fine = change_tests(scaled, fine_ages_of(len(window)))
+            gain = evidence + self._gain(fine, np.ones_like(fine.size), found.fit.shared)
+            if gain.max() > best.evidence:
+                kind, age, index = (int(x) for x in np.unravel_index(np.argmax(gain), gain.shape))
+                size, shift = float(fine.size[kind, age, index]), fine.shift[kind, age, index]
+                best = _Explanation(float(gain.max()), kind, int(fine.ages[age]), index, size, size * shift)
+        if best.evidence - without < self._price(tests.ages) or best.kind == _RAMP:
+            self._learn(window, tests)
             return
-        shift = tests.size[0, at, index]
-        before = found.fit.shared + tests.shift[0, at, index] * shift
-        first = len(window) - int(tests.ages[at])
+        first = len(window) - best.age
         time = float(window.times[first])
-        value, error = window.release(first, index, before, shift)
-        self._pending = [x for x in self._pending if x.index != index]
-        self._pending.append(_Pending(index, time, value, error))
+        value, error = window.release(first, best.index, found.fit.shared + best.shift, best.size)
+        self._pending = [x for x in self._pending if x.index != best.index]
+        self._pending.append(_Pending(best.index, time, value, error))
 
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""
@@ -163,11 +177,13 @@ class Changes:
         for one in list(self._pending):
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
-            if change > significant * both and error < _DETERMINED * change:
+            settled = abs(after - self._before[one.index]) < error < _DETERMINED * change
+            if settled and change > significant * both:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
             elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
                 self._pending.remove(one)
+        self._before = window.fit.shared
 
     def _say(self, one: _Pending, after: float, error: float, now: float) -> None:
         """Report a change."""

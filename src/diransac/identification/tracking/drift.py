@@ -19,6 +19,8 @@ __all__ = ["Drift"]
 _RATES = np.concatenate([[0.0], np.logspace(-6.0, -1.0, 16)])
 # Gain of the log-likelihood from which on a parameter drifts, and time over which it is remembered, s.
 _CLEAR, _MEMORY = 3.0, 60.0
+# Degrees of freedom of the differences: one window that differs by very much is no drift.
+_TAIL = 4.0
 # Part of the variance of a difference that is no drift at least.
 _LEAST = 0.05
 
@@ -59,7 +61,7 @@ class Drift:
         rates = np.square(np.abs(values)[:, None] * _RATES)
         more = (rates - self.rate[:, None]) * window
         total = np.maximum(variance[:, None] + more, _LEAST * variance[:, None])
-        gain = -0.5 * (np.log(total / variance[:, None]) + np.square(size)[:, None] / total)
+        gain = -0.5 * (np.log(total) + (_TAIL + 1.0) * np.log1p(np.square(size)[:, None] / (_TAIL * total)))
         self.likelihood *= np.exp(-weight * window / _MEMORY)
         self.likelihood[known] += weight * gain[known]
         best = np.argmax(self.likelihood, axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,10 +16,12 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["gain_of_forces", "with_forces"]
+__all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
 
-# Factors by which unmodelled accelerations may be larger from a time on, and their correlation then.
-_FACTORS, _GUST = 4.0 ** np.arange(1, 6), 0.9
+# Factors by which unmodelled accelerations may be larger than usual, and their correlation then.
+_FACTORS, _GUST = 6.0 ** np.arange(6), 0.9
+# Unmodelled accelerations that are large, over those that are expected.
+_LARGE = 30.0
 
 
 class _Terms(NamedTuple):
@@ -70,27 +73,40 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def gain_of_forces(found: Linearization, age: int) -> float:
-    """Evidence, nats, that larger unmodelled accelerations of the last intervals gain.
+def explanations_by_forces(found: Linearization) -> Iterator[tuple[Linearization, float]]:
+    """The linearised window with larger unmodelled accelerations, as a gust has, and its evidence with each, nats.
 
     Parameters
     ----------
     found : Linearization
-    age : int
-        Number of these intervals.
+    """
+    fit = found.fit
+    for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
+        for factor in _FACTORS:
+            scaled = with_forces(found, factor * fit.tau, rho)
+            yield scaled, _evidence(scaled)
+
+
+def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:
+    """Evidence, nats, that unmodelled accelerations gain over a model that is exact.
+
+    Parameters
+    ----------
+    found : Linearization
+    least, expected : (n_v,) array
+        Sizes of the unmodelled accelerations of an exact model, and those that are expected of any other.
 
     Returns
     -------
     float
-        The largest over sizes; 0 where none gains.
+        The larger one of the sizes of the fit, where they are larger than the least, and of some others.
     """
-    fit, before = found.fit, _evidence(found)
-    recent = (np.arange(len(fit.x)) >= len(fit.x) - age)[:, None]
-    gains = [0.0]
-    for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
-        for factor in _FACTORS:
-            gains.append(_evidence(with_forces(found, fit.tau * np.where(recent, factor, 1.0), rho)) - before)
-    return max(gains)
+    none = np.zeros_like(least)
+    exact = _evidence(with_forces(found, least, none))
+    others = [(expected, none), (_LARGE * expected, none + _GUST)]
+    if (found.fit.tau > least).any():
+        others = [(found.fit.tau, found.fit.rho)]
+    return max(_evidence(with_forces(found, *x)) for x in others) - exact
 
 
 def _evidence(found: Linearization) -> float:

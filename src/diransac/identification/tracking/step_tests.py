@@ -22,10 +22,12 @@ from diransac.arrays import FloatArray, IntArray
 if TYPE_CHECKING:
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["ChangeTests", "ages_of", "change_tests"]
+__all__ = ["ChangeTests", "ages_of", "change_tests", "fine_ages_of"]
 
 # Part of the information of a change that the other unknowns must leave, for it to be determined.
 _DETERMINED = 1e-9
+# Ratio of neighbouring ages of changes that are compared.
+_FINELY = 1.2
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,22 @@ def ages_of(n: int) -> IntArray:
     (A,) int array
     """
     return np.array([*(2**i for i in range(1, n.bit_length()) if 2**i < n), n])
+
+
+def fine_ages_of(n: int) -> IntArray:
+    """Ages of changes that are compared in a window of n intervals: all of the last ones, and ever fewer before.
+
+    Parameters
+    ----------
+    n : int
+
+    Returns
+    -------
+    (A,) int array
+    """
+    return np.unique(np.minimum(np.round(1.2 ** np.arange(1, 1 + np.ceil(np.log(n) / np.log(1.2)))), n)).astype(
+        np.int64
+    )
 
 
 def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:

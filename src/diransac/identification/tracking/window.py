@@ -12,10 +12,12 @@ from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
+    effect_on_state,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
 )
+from diransac.identification.tracking.forces import gain_of_freedom
 from diransac.identification.tracking.marginal import marginal
 from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
@@ -33,8 +35,10 @@ _MOST_STEPS, _SETTLED = 3, 0.1
 # Time over which noise and unmodelled accelerations are remembered after the window, s: a minute of a sensor at 1 Hz
 # still gives its noise to 10 %.
 _MEMORY = 60.0
-# Unmodelled accelerations of a model that is exact, over the accelerations: nothing that a sensor shows.
-_EXACT = 3e-5
+# Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
+_EXACT = 1e-6
+# Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
+_AS_LIKELY = 5.0
 # Standard deviation of a parameter of which nothing is known after a change, over the parameter.
 _FREE = 10.0
 
@@ -78,14 +82,16 @@ class Window:
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self.spread = setup, stream, first, fit, spread
-        self.least = _EXACT * spread
+        self.least, self.expected = _EXACT * spread, setup.settings.prior_model_error * spread
         n = len(fit.x)
         self.length = stream.length // setup.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
         none = np.zeros_like(fit.noise.sigma)
         self.noise = NoiseSums(none, none, none)
+        self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
+        self.freedom = 0.0
+        self._found, self._gained = np.square(fit.tau), np.inf
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
-        self.damping = 0.0
         self.last: Linearization | None = None
 
     def __len__(self) -> int:
@@ -161,18 +167,18 @@ class Window:
         float, float
             The parameter before the change, and its standard error.
         """
-        whole, rows = self.fit, first * self.length
+        whole = self.fit
         fit, value, error = self._fit_before(first, index, before)
-        shared = fit.shared.copy()
+        shared, rows = fit.shared.copy(), first * self.length
         shared[index] += change
         assert fit.boundary is not None
-        free = np.zeros((len(shared), 1))
-        free[index] = _FREE * max(abs(shared[index]), abs(change))
-        boundary = fit.boundary.diffused(free)
+        # The change may be within the interval before or after, whose motion is then that of neither.
+        free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
+        free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
+        boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)
-        self.damping = 0.0
         self.optimise()
         return value, error
 
@@ -204,18 +210,23 @@ class Window:
         intervals = self.intervals()
         weights = weights_of_free_motion(self) if is_surprised(self) else None
         first: Linearization | None = None
+        damping = 0.0
         for _ in range(_MOST_STEPS):
             at = linearized(intervals, self.fit, weights)
             before = self.fit
-            taken = gauss_newton_step(intervals, before, at, self.damping)
-            self.last = Linearization(intervals, before, at.of_fit, taken.solved)
-            self.damping = taken.damping
-            self.fit = self._with_scales(intervals, taken.fit, taken.solved)
+            taken = gauss_newton_step(intervals, before, at, damping)
+            # Damping is no information.
+            solved = at.step(at.right).of_fit if damping or taken.damping else taken.solved
+            damping = taken.damping
+            self.last = Linearization(intervals, before, at.of_fit, solved)
+            self.fit = self._with_scales(intervals, taken.fit, solved)
             first = first or self.last
             moved = np.abs(taken.fit.shared - before.shared)
-            if (moved <= _SETTLED * np.sqrt(np.diag(taken.solved.var_p))).all():
+            if (moved <= _SETTLED * np.sqrt(np.diag(solved.var_p))).all():
                 break
         assert first is not None
+        assert self.last is not None
+        self._gained = gain_of_freedom(self.last, self.least, self.expected)
         return first
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
@@ -223,10 +234,22 @@ class Window:
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
         process = process_sums(intervals, fit, solved).total()
-        tau = np.maximum(process.likeliest_size(fit.tau), self.least)
-        rho = np.where(tau > self.least, process.correlation(self.least), 0.0)
+        size = process.likeliest_size(fit.tau)
+        self._found = np.square(size)
+        tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
+        rho = np.zeros_like(tau) if self.is_exact else process.correlation(self.expected)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
         return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
+
+    @property
+    def is_exact(self) -> bool:
+        """True unless unmodelled accelerations are likelier, in the window and in the last minute before it."""
+        return self.freedom + self._gained < _AS_LIKELY
+
+    def _usual_size(self) -> FloatArray:
+        """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
+        usual = np.sqrt(self.sizes / self.weight) if self.weight else np.zeros_like(self.expected)
+        return np.asarray(np.maximum(usual, self.expected))
 
     def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
@@ -236,6 +259,8 @@ class Window:
         faded = self.kept**n
         sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         self.noise = sums.plus(self.noise, faded)
+        self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
+        self.freedom = faded * self.freedom + n / len(intervals) * self._gained
 
     # ------------------------------------------------------------------ what it tells
 

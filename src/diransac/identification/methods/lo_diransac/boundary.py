@@ -94,12 +94,13 @@ class BoundaryPrior:
         return self.offset - self.root @ (boundary_unknowns(fit) - self.point)
 
     def diffused(self, change: FloatArray) -> BoundaryPrior:
-        """The Gaussian after random changes of the last unknowns, the shared ones.
+        """The Gaussian after random changes of the last unknowns.
 
         Parameters
         ----------
-        change : (n_s, r) array
-            Square root of the covariance of the changes.
+        change : (m, r) array
+            Square root of the covariance of the changes of the last m unknowns: shared ones, which unmodelled
+            accelerations may precede.
 
         Returns
         -------

@@ -23,7 +23,15 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["SHRINK", "ProcessSums", "most_probable_size", "negligible_jumps", "process_sums", "unbroken_jumps"]
+__all__ = [
+    "SHRINK",
+    "ProcessSums",
+    "effect_on_state",
+    "most_probable_size",
+    "negligible_jumps",
+    "process_sums",
+    "unbroken_jumps",
+]
 
 SHRINK = 0.4
 """Largest change of any scale in a step."""
@@ -100,7 +108,7 @@ class ProcessSums:
         """
         weight = np.maximum(self.weight, _TINY)
         hidden = 1.0 - np.square(now) * np.sqrt(weight / np.maximum(self.count, 1.0))
-        alike = (self.cross / weight).clip(0.0, _MOST_ALIKE)
+        alike = (self.cross / np.maximum(self.weight, self.cross)).clip(0.0, _MOST_ALIKE)
         chance = np.sqrt(2.0 / weight * (1.0 + alike) / (1.0 - alike))
         size = self.surplus / weight - _CHANCE * hidden.clip(0.0) * chance
         return np.asarray(np.clip(np.sqrt(size.clip(0.0)), SHRINK * now, now / SHRINK))
@@ -186,10 +194,24 @@ def negligible_jumps(intervals: ShootingIntervals, tau: FloatArray) -> FloatArra
     -------
     (n_x,) array
     """
-    T = intervals.duration
-    velocity = _CONTINUITY * tau * T
+    return _CONTINUITY * effect_on_state(intervals, tau)
+
+
+def effect_on_state(intervals: ShootingIntervals, acceleration: FloatArray) -> FloatArray:
+    """Size of the change ``(n_x,)`` of the state by accelerations ``(n_v,)`` over an interval.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    acceleration : (n_v,) array
+
+    Returns
+    -------
+    (n_x,) array
+    """
+    velocity = acceleration * intervals.duration
     n_q, derived = intervals.model.n_q, intervals.model.kinematics is None
-    coordinate = velocity[:n_q] * T if derived else np.full(n_q, velocity.max() * T)
+    coordinate = (velocity[:n_q] if derived else np.full(n_q, velocity.max())) * intervals.duration
     return np.concatenate([coordinate, velocity])
 
 
