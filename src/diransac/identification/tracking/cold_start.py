@@ -49,6 +49,10 @@ class ColdStart:
         self._running: Future[Result] | None = None
         self._needed = window
 
+    def restart(self) -> None:
+        """Begin again with the rows of one window."""
+        self._running, self._needed = None, self.window
+
     def sought(self, stream: Stream, end: int) -> Found | None:
         """The start, once there is one that is usable.
 

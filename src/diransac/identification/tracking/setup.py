@@ -76,7 +76,7 @@ class Setup:
         measured = held[rows, : self.n_signals]
         known = np.isfinite(measured)
         missing = np.asarray(np.isnan(held[:, self.n_signals :]).any(axis=1))
-        inputs = _held(held[:, self.n_signals :])
+        inputs = _interpolated(held[:, self.n_signals :])
         acting = self.timing.acting(inputs, stream.dt, self.hold)[rows]
         return ShootingIntervals(
             model=self.model,
@@ -95,12 +95,11 @@ class Setup:
         )
 
 
-def _held(inputs: FloatArray) -> FloatArray:
-    """Inputs ``(N, n_u)`` held from the last finite sample; the first one before it, 0 without any."""
-    known = np.isfinite(inputs)
-    if known.all():
-        return inputs.copy()
-    rows = np.where(known, np.arange(len(inputs))[:, None], -1)
-    last = np.maximum.accumulate(rows, axis=0)
-    first = np.argmax(known, axis=0)
-    return np.where(known.any(axis=0), np.take_along_axis(inputs, np.where(last < 0, first, last), axis=0), 0.0)
+def _interpolated(inputs: FloatArray) -> FloatArray:
+    """Inputs ``(N, n_u)`` with missing samples interpolated, and held at both ends; 0 without any sample."""
+    filled, rows = inputs.copy(), np.arange(len(inputs))
+    for column in filled.T:
+        known = np.isfinite(column)
+        if not known.all():
+            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
+    return filled

@@ -116,10 +116,7 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     with_prior = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
     prior = make_prior(setup.settings, with_prior, motion, np.full(len(p), np.inf))
     fit = refine(setup.settings, with_prior, start(setup.settings, with_prior, motion, p, prior), prior).fit
-    n_x = fit.x.shape[1]
-    return Window(
-        setup, stream, first, _with_boundary(fit, p, covariance), motion.spread[n_x : n_x + setup.model.n_v], most
-    )
+    return Window(setup, stream, first, _with_boundary(fit, p, covariance), motion.spread, most)
 
 
 def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:

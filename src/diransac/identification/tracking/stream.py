@@ -24,8 +24,10 @@ _FIRST_STAMPS = 25
 _CONFIRMED = 3
 # Time without a row from which on a new stretch begins, s and rows: as `data.segment.silent_rows`.
 _LONG_SILENCE, _FEWEST_SILENT = 0.25, 8
-# Share of the difference of a stamp from its row by which the grid follows the clock.
-_GAIN = 0.01
+# Rows over which the grid is the line of least squares through the stamps, and beyond which it forgets older ones.
+_LINE = 400
+# Rows of one stamp from which on the time does not advance.
+_STANDSTILL = 1000
 
 Row = tuple[float, FloatArray]
 
@@ -36,8 +38,8 @@ class Stream:
 
     Parameters
     ----------
-    n_columns : int
-        Number of columns: signals, then inputs.
+    n_columns, n_inputs : int
+        Number of columns, the last of which are inputs.
     step : float
         Time between estimates, s.
     duration : float
@@ -57,9 +59,12 @@ class Stream:
         Number of the first row that is held, and of the newest one.
     fresh : int
         Number of the first row of the present stretch.
+    lag : int
+        Rows by which inputs come late, a step at most: an interval is complete when they are there.
     """
 
     n_columns: int
+    n_inputs: int
     step: float
     duration: float
     dt: float = 0.0
@@ -69,13 +74,15 @@ class Stream:
     first: int = 0
     newest: int = -1
     fresh: int = 0
+    lag: int = 0
     _origin: float = 0.0
+    _n_rows: int = _FIRST_STAMPS
     _early: list[Row] = field(default_factory=list)
     _suspects: list[Row] = field(default_factory=list)
     _notes: list[str] = field(default_factory=list)
 
     def feed(self, time: FloatArray, values: FloatArray) -> Iterator[int]:
-        """Take rows in the order in which they come, and yield the newest row whenever there is another.
+        """Take rows in the order in which they come, and yield the row after the last complete one at each new row.
 
         Parameters
         ----------
@@ -94,7 +101,7 @@ class Stream:
                 before = self.newest
                 self._take(stamp, cells)
                 if self.newest > before:
-                    yield self.newest
+                    yield self.newest + 1 - self.lag
 
     def time(self, row: int) -> float:
         """Time of a row of the present stretch, s."""
@@ -116,6 +123,8 @@ class Stream:
     def _begun(self, t: float, row: FloatArray) -> list[Row]:
         """The first rows once the grid is known; none before."""
         self._early.append((t, row.copy()))
+        if len(self._early) > _STANDSTILL:
+            raise LogError(f"the time of the stream stands still at t = {t:.6g} s; give the time of each sample")
         stamps = np.unique([t for t, _ in self._early])
         if len(stamps) < _FIRST_STAMPS:
             return []
@@ -147,8 +156,19 @@ class Stream:
             self._suspect(t, cells)
             return
         self._suspects.clear()
+        if row > self.newest:
+            self._follow(row, place - row)
+        elif np.isfinite(cells[-self.n_inputs :]).any():
+            self.lag = max(self.lag, min(self.newest - row, self.length))
         self._write(row, cells)
-        self._origin += _GAIN * (place - row) * self.dt
+
+    def _follow(self, row: int, late: float) -> None:
+        """Move the grid by a stamp that is late by a part of a row: recursive least squares of a line."""
+        self._n_rows = min(self._n_rows + 1, _LINE)
+        n = self._n_rows
+        change = 6.0 / (n * (n + 1)) * late * self.dt
+        self._origin += (4 * n - 2) / (n * (n + 1)) * late * self.dt - change * row
+        self.dt += change
 
     def _repeats(self, row: int, cells: FloatArray) -> bool:
         """True for a row from before the newest one that is known already, as after a clock that restarts."""

@@ -94,7 +94,7 @@ class Tracker:
         self._names = (*model.signals, *model.inputs)
         self._steps = max(2, round(window / step))
         self._step, self._held = step, _HELD * window
-        self._stream = Stream(len(self._names), step, self._held + step)
+        self._stream = Stream(len(self._names), model.n_u, step, self._held + step)
         self._cold = ColdStart(self._setup, seed, window, background=background)
         self._changes = Changes(self._setup, step, false_alarms_per_hour, drift or {})
         self._sensors = SensorWatch(self._setup)
@@ -156,12 +156,14 @@ class Tracker:
     def _estimates(self, time: FloatArray, rows: FloatArray) -> Iterator[TrackedEstimate]:
         """An estimate whenever a step is complete."""
         with single_threaded():
-            for newest in self._stream.feed(time, rows):
+            for end in self._stream.feed(time, rows):
                 self._notes += self._stream.taken_notes()
                 if self._window is None:
-                    self._begin(newest + 1)
-                while self._window is not None and self._advanced(self._window, newest + 1):
+                    self._begin(end)
+                while self._window is not None and self._advanced(self._window, end):
                     yield self._estimate(self._window)
+                    if self._window.is_hopeless:
+                        self._begin_anew()
 
     # ------------------------------------------------------------------ the window
 
@@ -178,16 +180,25 @@ class Tracker:
         n = min((end - first) // stream.length, self._steps)
         if n * stream.length * stream.dt < _FIRST - 1e-9 or end < self._retry:
             return
+        parts = self._setup.parts
         try:
-            parts = self._setup.parts
-            self._window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
-        except DiransacError:
+            window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
+            window.optimise()
+        except DiransacError:  # too few samples as yet
             self._retry = end + stream.length
-            return
-        self._window.optimise()
+        except np.linalg.LinAlgError:
+            self._begin_anew()
+        else:
+            self._window = window
+
+    def _begin_anew(self) -> None:
+        """Forget a fit that explains nothing, and identify the parameters from the rows that are held."""
+        self._window, self._start = None, None
+        self._cold.restart()
+        self._notes.append("the parameters explain none of the motion, and are identified anew")
 
     def _advanced(self, window: Window, end: int) -> bool:
-        """Move the window on by a step where its rows are complete."""
+        """Move the window on by a step where its rows are complete; False where they are not, or its fit fails."""
         stream, parts = self._stream, self._setup.parts
         new = stream.fresh >= window.end
         n = self._joining(end) if new else parts
@@ -198,12 +209,15 @@ class Tracker:
             window.leave(min(excess, len(window) - 1))
             stream.drop(window.first // stream.length * stream.length - stream.first)
         self._changes.before_step(window)
-        if new:
-            window.join(self._states(window, n))
-        else:
-            window.extend(n)
-        self._changes.after_step(window, window.optimise())
-        return True
+        try:
+            if new:
+                window.join(self._states(window, n))
+            else:
+                window.extend(n)
+            self._changes.after_step(window, window.optimise())
+        except np.linalg.LinAlgError:
+            self._begin_anew()
+        return self._window is not None
 
     def _joining(self, end: int) -> int | None:
         """Number of the first intervals of a new stretch; None where there are too few rows."""

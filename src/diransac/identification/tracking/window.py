@@ -37,6 +37,8 @@ _MOST_STEPS, _SETTLED = 3, 0.1
 _MEMORY = 60.0
 # Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
 _EXACT = 1e-6
+# Part of the spread of a signal from which on its noise leaves nothing to explain; as in `search`.
+_ALL_OF_IT = 0.8
 # Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
 _AS_LIKELY = 5.0
 # Standard deviation of a parameter of which nothing is known after a change, over the parameter.
@@ -73,16 +75,18 @@ class Window:
         First row of the window.
     fit : Fit
         Of its intervals.
-    spread : (n_v,) array
-        Of the accelerations.
+    spread : (n_signals,) array
+        Of the signals, as in `Motion`.
     most : int
         Number of intervals of the window once it is full.
     """
 
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
-        self.setup, self.stream, self.first, self.fit, self.spread = setup, stream, first, fit, spread
-        self.least, self.expected = _EXACT * spread, setup.settings.prior_model_error * spread
+        self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
+        self.spread = spread[fit.x.shape[1] : fit.x.shape[1] + fit.d.shape[1]]
+        self._n_hopeless = 0
+        self.least, self.expected = _EXACT * self.spread, setup.settings.prior_model_error * self.spread
         n = len(fit.x)
         self.length = stream.length // setup.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
@@ -227,7 +231,19 @@ class Window:
         assert first is not None
         assert self.last is not None
         self._gained = gain_of_freedom(self.last, self.least, self.expected)
+        self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
         return first
+
+    @property
+    def is_hopeless(self) -> bool:
+        """True if the fit has explained nothing in as many steps as the window has intervals."""
+        return self._n_hopeless >= self.most
+
+    def _explains_nothing(self, intervals: ShootingIntervals) -> bool:
+        """True if noise or unmodelled accelerations are as large as the signals themselves."""
+        seen = intervals.known.any(axis=0)
+        noise = (self.fit.noise.sigma > _ALL_OF_IT * self._spread)[seen].all()
+        return bool(noise or (self.fit.tau > self.spread).any())
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""
