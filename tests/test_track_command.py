@@ -1,6 +1,7 @@
 """The command ``track``: over a log, and over a file that grows under a clock that is no real one."""
 
 import json
+import re
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -157,6 +158,18 @@ def test_a_known_parameter_is_not_tracked_and_a_result_is_a_start():
     rest = ["--start", "linear_drag=10,quadratic_drag=25,bias=1"]
     fixed = run("track", "swim.csv", *MODEL, "--fix", "mass=50", *rest, "--json")
     assert list(json.loads(fixed.stdout)["parameters"]) == ["linear_drag", "quadratic_drag", "bias"]
+
+
+def test_a_terminal_shows_the_newest_estimate_in_a_line_and_nothing_else_does(monkeypatch: pytest.MonkeyPatch):
+    plain = run(*TRACK)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    shown = run(*TRACK)
+    assert plain.stderr == ""
+    lines = [x for x in shown.stderr.split("\r\x1b[2K") if x.startswith("t ")]
+    assert re.match(r"t 6\.0 s  mass \d+(\.\d+)? ± 0\.\d+ kg  linear_drag ", lines[-1])
+    assert all(len(x.splitlines()[0]) <= 80 for x in lines)
+    assert shown.stdout == plain.stdout
+    assert run("-q", *TRACK).stderr == ""
 
 
 @pytest.mark.parametrize(

@@ -251,7 +251,9 @@ def live() -> Iterator[Callable[[str], None]]:
     from rich.text import Text
 
     with Live(Text(""), console=Console(stderr=True), transient=True, auto_refresh=False) as shown:
-        yield lambda line: shown.update(Text(printable(one_line(line))), refresh=True)
+        yield lambda line: shown.update(
+            Text(printable(one_line(line)), no_wrap=True, overflow="ellipsis"), refresh=True
+        )
 
 
 def shows_bars() -> bool:

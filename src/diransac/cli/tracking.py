@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +19,7 @@ from diransac.arrays import FloatArray
 from diransac.data.preprocessing import unit_factors
 from diransac.errors import ResultError
 from diransac.identification.tracking.history import History, change_text
+from diransac.plain_text import one_line
 from diransac.text_table import aligned, number, percent, plural
 
 if TYPE_CHECKING:
@@ -123,7 +126,7 @@ class TrackTable:
     def __init__(self, path: Path, model: Model) -> None:
         names = tuple(model.parameters)
         self._path, self._names = path, names
-        header = ",".join(["t", *names, *(f"{name}_standard_error" for name in names)])
+        header = _fields(["t", *names, *(f"{name}_standard_error" for name in names)])
         try:
             self._there = self._opened(header)
             self._file: IO[str] = path.open("a", encoding="utf-8", newline="\n")
@@ -150,7 +153,7 @@ class TrackTable:
     def add(self, now: TrackedEstimate) -> bool:
         """Write a row; False where it is there already.  Raises ResultError: another row is there, or it cannot be."""
         cells = [now.time, *(now.parameters[n] for n in self._names), *(now.standard_errors[n] for n in self._names)]
-        row = ",".join(map(repr, map(float, cells)))
+        row = _fields([repr(float(x)) for x in cells])
         if self._there is not None:
             found = self._there.readline()
             if found:
@@ -183,6 +186,13 @@ class TrackTable:
         self._file.close()
         if self._there is not None:
             self._there.close()
+
+
+def _fields(texts: Sequence[str]) -> str:
+    """A line of CSV; line breaks within texts are none."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow([one_line(x) for x in texts])
+    return line.getvalue()
 
 
 def _remove_partial_line(path: Path) -> None:
