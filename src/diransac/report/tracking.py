@@ -23,7 +23,7 @@ _INTERVAL = 1.96
 # Part of the values that may be outside of a figure: those of the first seconds.
 _TAIL = 0.02
 # Width of the mark of a change, as a part of the axis.
-_MARK = 0.004
+_MARK = 0.006
 # Intervals between estimates, in usual ones, from which on no line joins them.
 _GAP = 1.5
 
@@ -182,7 +182,7 @@ def _signal_figures(history: History, axis: _Axis) -> list[Figure]:
         panels = []
         for values, heading, unit in ((share, "fraction of outliers", ""), (noise, "noise", units[name])):
             known = values[np.isfinite(values)]
-            scale = padded(0.0, float(known.max()) if len(known) else 1.0)
+            scale = padded(0.0, float(known.max(initial=0.0)) or 1.0)
             text = f"{heading} of {name}{f' in {unit}' * bool(unit)} over time"
             plot = time_plot([axis.trace(heading, "m0", values)], scale, axis.timeline, text, look="residual")
             panels.append(Panel(plot, f"{heading}{f', {unit}' * bool(unit)}"))
