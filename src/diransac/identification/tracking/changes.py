@@ -153,7 +153,7 @@ class Changes:
     def _decide(self, window: Window, found: Linearization, tests: ChangeTests) -> None:
         """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
         best, without = _Explanation(-np.inf), -np.inf
-        for scaled, evidence in explanations_by_forces(found):
+        for scaled, evidence in explanations_by_forces(found, window.expected):
             without = max(without, evidence)
             fine = change_tests(scaled, fine_ages_of(len(window)))
             gain = evidence + self._gain(fine, np.ones_like(fine.size), found.fit.shared)

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
 
-# Factors by which unmodelled accelerations may be larger than usual, and their correlation then.
-_FACTORS, _GUST = 6.0 ** np.arange(6), 0.9
+# Factors by which unmodelled accelerations may be larger than usual, their correlation then, and the number of the
+# last intervals that a gust may be in.
+_FACTORS, _GUST, _RECENT = 6.0 ** np.arange(4), 0.9, 8
 # Unmodelled accelerations that are large, over those that are expected.
 _LARGE = 30.0
 
@@ -73,18 +74,41 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def explanations_by_forces(found: Linearization) -> Iterator[tuple[Linearization, float]]:
-    """The linearised window with larger unmodelled accelerations, as a gust has, and its evidence with each, nats.
+def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterator[tuple[Linearization, float]]:
+    """The linearised window with its unmodelled accelerations, and with larger ones, as a gust has, from a time on.
+
+    One after the other becomes larger, as long as the evidence does.
 
     Parameters
     ----------
     found : Linearization
+    expected : (n_v,) array
+        Size of the unmodelled accelerations of any model.
+
+    Yields
+    ------
+    Linearization
+    float
+        Its evidence, nats.
     """
-    fit = found.fit
-    for rho in (fit.rho, np.maximum(fit.rho, _GUST)):
-        for factor in _FACTORS:
-            scaled = with_forces(found, factor * fit.tau, rho)
-            yield scaled, _evidence(scaled)
+    fit, W = found.fit, len(found.fit.x)
+    usual, least = np.broadcast_to(fit.tau, fit.d.shape), np.maximum(fit.tau, expected)
+    rho = np.maximum(fit.rho, _GUST)
+    best, evidence = usual, _evidence(found)
+    yield found, evidence
+    larger = [
+        np.where((np.arange(W) >= W - age)[:, None], factor * least, usual)
+        for age in (min(_RECENT, W), W)
+        for factor in _FACTORS
+    ]
+    for axis in np.eye(len(expected), dtype=bool):
+        trials = [np.where(axis, tau, best) for tau in larger]
+        found_with = [with_forces(found, tau, rho) for tau in trials]
+        evidences = [_evidence(x) for x in found_with]
+        k = int(np.argmax(evidences))
+        if evidences[k] > evidence:
+            best, evidence = trials[k], evidences[k]
+            yield found_with[k], evidence
 
 
 def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:

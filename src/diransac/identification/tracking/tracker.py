@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from diransac.data import preprocessing
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
 from diransac.errors import DiransacError, LogError, SettingsError
+from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.cold_start import ColdStart
 from diransac.identification.tracking.estimates import TrackedEstimate
@@ -59,6 +60,8 @@ class Tracker:
         Seed of that identification.
     false_alarms_per_hour : float, optional
         Changes that are reported per hour of a machine that does not change.
+    fixed : mapping of str to float, or iterable of str, optional
+        Parameters that are not tracked, with their values, as in `identify`; those of a `Result` remain fixed.
     drift : mapping of str to float, optional
         Standard deviation by which a parameter changes at random in a second, in its unit; 0 for one that never drifts.
         None, or a name that is not given: estimated.
@@ -80,12 +83,14 @@ class Tracker:
         start: Mapping[str, float] | Result | None = None,
         seed: int = 0,
         false_alarms_per_hour: float = 0.1,
+        fixed: Mapping[str, float | None] | Iterable[str] | None = None,
         drift: Mapping[str, float] | None = None,
         background: bool = True,
     ) -> None:
         _check_positive(window=window, step=step, false_alarms_per_hour=false_alarms_per_hour)
         if window < 2.0 * step:
             raise SettingsError(f"window is {window:g} s and step {step:g} s; give a window of at least two steps")
+        model = model.with_fixed(_fixed(model, fixed, start))
         _check_names("drift", drift or {}, model)
         self._setup = Setup(model, ParameterLayout(model.parameters))
         self._start: Start | None = None
@@ -260,6 +265,7 @@ def track(
     start: Mapping[str, float] | Result | None = None,
     seed: int = 0,
     false_alarms_per_hour: float = 0.1,
+    fixed: Mapping[str, float | None] | Iterable[str] | None = None,
     drift: Mapping[str, float] | None = None,
 ) -> Iterator[TrackedEstimate]:
     """Estimates of a `Tracker` over a recorded log, one a step.
@@ -268,7 +274,7 @@ def track(
     ----------
     model : Model
     log : Log
-    window, step, start, seed, false_alarms_per_hour, drift : optional
+    window, step, start, seed, false_alarms_per_hour, fixed, drift : optional
         As those of `Tracker`.
 
     Returns
@@ -291,6 +297,7 @@ def track(
         start=start,
         seed=seed,
         false_alarms_per_hour=false_alarms_per_hour,
+        fixed=fixed,
         drift=drift,
         background=False,
     )
@@ -329,6 +336,15 @@ def _check_names(argument: str, values: Mapping[str, float], model: Model) -> No
             raise SettingsError(f'{argument} of "{name}" is {value!r}; give a number in its unit')
 
 
+def _fixed(
+    model: Model, fixed: Mapping[str, float | None] | Iterable[str] | None, start: Mapping[str, float] | Result | None
+) -> Mapping[str, float]:
+    """Values of the parameters that are not tracked."""
+    of_start = {} if start is None or isinstance(start, Mapping) else {n: start.parameters[n] for n in start.fixed}
+    known = KnownParameters.of(model, fixed, None).fixed
+    return {**{n: x for n, x in of_start.items() if n in model.parameters}, **known}
+
+
 def _started(setup: Setup, start: Mapping[str, float] | Result) -> tuple[Setup, Start]:
     """The problem and its start, from rough values or an identification."""
     parameters = setup.model.parameters
@@ -339,10 +355,11 @@ def _started(setup: Setup, start: Mapping[str, float] | Result) -> tuple[Setup, 
         if lacking:
             raise SettingsError(f'start lacks "{lacking[0]}"; give a rough value of it')
         return setup, Start(np.array([float(x) for x in values.values() if x is not None]))
-    if tuple(start.parameters) != tuple(parameters):
+    free = [k for k, name in enumerate(start.parameters) if name in parameters]
+    if [tuple(start.parameters)[k] for k in free] != list(parameters):
         raise SettingsError(
             f"start has the parameters {', '.join(start.parameters)}, the model has {', '.join(parameters)}"
         )
     resolution = start.estimate.resolution
-    given = Start(np.array(list(start.parameters.values())), start.covariance)
+    given = Start(np.array(list(start.parameters.values()))[free], start.covariance[np.ix_(free, free)])
     return replace(setup, hold=resolution.hold, timing=resolution.timing), given
