@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Derivation",
+    "FixedParameters",
     "JsonFlag",
     "LogFile",
     "LogFiles",
@@ -47,6 +48,7 @@ __all__ = [
     "Report",
     "ResultFile",
     "Search",
+    "Seed",
     "StrictFlag",
     "TimeLimit",
     "known_methods",
@@ -164,6 +166,11 @@ StrictFlag = Annotated[
     bool, typer.Option("--strict", help='End with exit code 3 where the verdict is "do not rely on this".')
 ]
 
+Seed = Annotated[int, typer.Option(help="The same seed gives the same answer.")]
+FixedParameters = Annotated[
+    list[str] | None,
+    typer.Option("--fix", metavar="NAME[=VALUE],...", help="Parameters that are known: mass=0.25, or by name."),
+]
 TimeLimit = Annotated[
     float | None,
     typer.Option("--time-limit", metavar="S", help="End the search after so many seconds, with what it has found."),
@@ -177,7 +184,7 @@ _option = partial(typer.Option, rich_help_panel="Preparation of the log, in this
 class Search:
     """Options of the identification: seed, settings, hold of the inputs, and parameters that are known."""
 
-    seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
+    seed: Seed = 0
     settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
     assignments: Annotated[
         list[str] | None,
@@ -203,10 +210,7 @@ class Search:
         ),
     ] = None
 
-    fixed: Annotated[
-        list[str] | None,
-        typer.Option("--fix", metavar="NAME[=VALUE],...", help="Parameters that are known: mass=0.25, or by name."),
-    ] = None
+    fixed: FixedParameters = None
     priors: Annotated[
         list[str] | None,
         typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),

@@ -15,13 +15,23 @@ from diransac.cli import screen
 from diransac.cli.arguments import fixed_parameters, model_file, preparation_of, start_values
 from diransac.cli.flight_options import FlightPicture
 from diransac.cli.group import grouped
-from diransac.cli.options import JsonFlag, LogFile, ModelName, Preparation, Report, output_or_stdout
+from diransac.cli.options import (
+    FixedParameters,
+    JsonFlag,
+    LogFile,
+    ModelName,
+    Preparation,
+    Report,
+    Seed,
+    output_or_stdout,
+)
 from diransac.cli.outputs import PAGE, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.tracking import Summary, TrackTable, as_line, followed, to_dict, tracked
 from diransac.data.readers.growing import Growing
 from diransac.errors import LogError
 from diransac.identification.result import Result
+from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking import TrackedEstimate, Tracker, track
 from diransac.identification.tracking.history import History
 from diransac.model import Model
@@ -45,28 +55,24 @@ class TrackerOptions:
             help="Where it starts; else from --model MODEL.json, or from an identification of the first seconds.",
         ),
     ] = None
-    fixed: Annotated[
-        list[str] | None, typer.Option("--fix", metavar="NAME=VALUE,...", help="Parameters that are known: mass=0.25.")
-    ] = None
+    fixed: FixedParameters = None
     false_alarms: Annotated[
         float, typer.Option("--false-alarms", metavar="N", help="Changes per hour of a machine that does not change.")
     ] = 0.1
-    seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
+    seed: Seed = 0
 
-    def model_of(self, whole: Model) -> Model:
-        """The model without the parameters that are known.  Raises typer.BadParameter: one has no value."""
-        known = fixed_parameters("--fix", self.fixed or ())
-        values = {name: x for name, x in known.items() if x is not None}
-        for name in known.keys() - values.keys():
-            raise typer.BadParameter(f"--fix: {name} has no value; give {name}=NUMBER")
-        return whole.with_fixed(values)
+    def model_of(self, whole: Model, start: Result | dict[str, float] | None) -> Model:
+        """The model without the parameters that are known, by option or in the result with which it starts."""
+        known = KnownParameters.of(whole, fixed_parameters("--fix", self.fixed or ()), None).fixed
+        of_start = {n: start.parameters[n] for n in start.fixed} if isinstance(start, Result) else {}
+        return whole.with_fixed({**of_start, **known})
 
-    def arguments(self, model: str) -> dict[str, Any]:
+    def arguments(self, start: Result | dict[str, float] | None) -> dict[str, Any]:
         """Arguments of `diransac.track`."""
         return {
             "window": self.window,
             "step": self.step,
-            "start": self._start(model),
+            "start": start,
             "seed": self.seed,
             "false_alarms_per_hour": self.false_alarms,
         }
@@ -75,7 +81,8 @@ class TrackerOptions:
         """The result that is the start, where one is named."""
         return Path(self.rough) if self.rough is not None and self.rough.endswith(".json") else None
 
-    def _start(self, model: str) -> Result | dict[str, float] | None:
+    def start(self, model: str) -> Result | dict[str, float] | None:
+        """Where the tracker starts."""
         file = self.start_file()
         if file is None and self.rough is None and model.endswith(".json"):
             file = Path(model)
@@ -111,8 +118,9 @@ def _track(
     _check(file, output, report, follow=follow, idle=idle, json_lines=json_lines)
     read = [None if file == STDOUT else file, model_file(model), options.start_file()]
     checked([output, plot, report], read)
-    machine, like = options.model_of(robot.load(model)), preparation_of(model)
-    arguments, history = options.arguments(model), History(machine)
+    start, like = options.start(model), preparation_of(model)
+    machine, arguments = options.model_of(robot.load(model), start), options.arguments(start)
+    history = History(machine)
     shown = _Shown(history, json_lines=json_lines)
     with staged([plot, report, None if follow else output], read) as (picture, page, written), ExitStack() as opened:
         findings = list[str]()
