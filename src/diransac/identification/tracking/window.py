@@ -12,6 +12,7 @@ from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
+    ProcessSums,
     effect_on_state,
     negligible_jumps,
     process_sums,
@@ -32,8 +33,8 @@ __all__ = ["Linearization", "Window"]
 
 # Steps at most with another interval; one that moves no parameter by more than so many standard errors is the last.
 _MOST_STEPS, _SETTLED = 3, 0.1
-# Time over which noise and unmodelled accelerations are remembered after the window, s: a minute of a sensor at 1 Hz
-# still gives its noise to 10 %.
+# Time over which noise, unmodelled accelerations, and parameters of a model that is not exact are remembered after the
+# window, s: a minute of a sensor at 1 Hz still gives its noise to 10 %.
 _MEMORY = 60.0
 # Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
 _EXACT = 1e-6
@@ -93,7 +94,7 @@ class Window:
         none = np.zeros_like(fit.noise.sigma)
         self.noise = NoiseSums(none, none, none)
         self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
-        self.freedom = 0.0
+        self.process, self.freedom = ProcessSums.none(len(fit.tau)), 0.0
         self._found, self._gained = np.square(fit.tau), np.inf
         self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
         self.last: Linearization | None = None
@@ -142,6 +143,8 @@ class Window:
         fit = self.fit
         kept = {name: getattr(fit, name)[n:] for name in ("x", "d", "ends")}
         self.fit = replace(fit, residuals=fit.residuals[rows:], boundary=boundary, **kept)
+        if not self.is_exact:  # errors of a model do not average out as noise does
+            self.fit = replace(self.fit, boundary=boundary.faded(self.kept**n))
         self.first, self.times = self.first + rows, self.times[n:]
 
     def diffuse(self, std: FloatArray) -> None:
@@ -253,7 +256,7 @@ class Window:
         size = process.likeliest_size(fit.tau)
         self._found = np.square(size)
         tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
-        rho = np.zeros_like(tau) if self.is_exact else process.correlation(self.expected)
+        rho = np.zeros_like(tau) if self.is_exact else process.plus(self.process).correlation(self.expected)
         continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
         return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
 
@@ -276,6 +279,8 @@ class Window:
         sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         self.noise = sums.plus(self.noise, faded)
         self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
+        process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
+        self.process = process.plus(self.process, faded)
         self.freedom = faded * self.freedom + n / len(intervals) * self._gained
 
     # ------------------------------------------------------------------ what it tells

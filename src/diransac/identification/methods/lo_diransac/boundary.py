@@ -93,6 +93,11 @@ class BoundaryPrior:
     def _deviation(self, fit: Fit) -> FloatArray:
         return self.offset - self.root @ (boundary_unknowns(fit) - self.point)
 
+    def faded(self, weight: float) -> BoundaryPrior:
+        """The Gaussian with its information multiplied by a weight."""
+        factor = np.sqrt(weight)
+        return replace(self, root=factor * self.root, offset=factor * self.offset)
+
     def diffused(self, change: FloatArray) -> BoundaryPrior:
         """The Gaussian after random changes of the last unknowns.
 

@@ -74,6 +74,11 @@ class ProcessSums:
     surplus: FloatArray
     cross: FloatArray
 
+    @classmethod
+    def none(cls, n_v: int) -> ProcessSums:
+        """Sums over no interval."""
+        return cls(*np.zeros((8, n_v)))
+
     def total(self) -> ProcessSums:
         """Sums over the intervals."""
         return ProcessSums(*(x.sum(axis=0) for x in self._all))
