@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
     from diransac.identification.settings import Settings
     from diransac.identification.structure.lacking_terms import Suggestion
+    from diransac.identification.tracking import Change, TrackedEstimate, Tracker, track
     from diransac.model.robots import JointTorques, MotorCurrents, PositionControl
     from diransac.plots import plot_flight
     from diransac.report import write_report
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METHODS",
+    "Change",
     "Controller",
     "CorruptedLog",
     "CrossValidation",
@@ -111,6 +113,8 @@ __all__ = [
     "Suggestion",
     "TimeLimitError",
     "TotalLeastSquares",
+    "TrackedEstimate",
+    "Tracker",
     "Trajectory",
     "Validation",
     "corrupt",
@@ -142,6 +146,7 @@ __all__ = [
     "sine",
     "square",
     "star",
+    "track",
     "tracking_error",
     "tvlqr",
     "tvlqr_batch",
@@ -193,6 +198,7 @@ _FOUND_IN = {
     "identification.structure.lacking_terms": ("Suggestion",),
     "identification.assessment.cross_validation": ("CrossValidation", "cross_validate"),
     "identification.assessment.validation": ("Validation", "validate"),
+    "identification.tracking": ("Change", "TrackedEstimate", "Tracker", "track"),
     "model.robots": ("JointTorques", "MotorCurrents", "PositionControl"),
     "plots": ("plot_flight",),
     "report": ("write_report",),

@@ -41,19 +41,16 @@ class AugmentedModel:
     model : Model
         Model whose parameters are the original ones; the discrepancies, equation by equation the bias and one gain per
         input; the unmodelled accelerations.
-    n_p, n_v, n_u : int
-        Number of parameters, velocities and inputs of the original model.
+    n_p, n_v : int
+        Number of parameters and velocities of the original model.
+    n_discrepancies : int
+        Number of input gain and bias discrepancies.
     """
 
     model: Model
     n_p: int
     n_v: int
-    n_u: int
-
-    @property
-    def n_discrepancies(self) -> int:
-        """Number of input gain and bias discrepancies."""
-        return self.n_v * (self.n_u + 1)
+    n_discrepancies: int
 
     @property
     def unknowns(self) -> tuple[str, ...]:
@@ -63,12 +60,14 @@ class AugmentedModel:
 
 
 @lru_cache(maxsize=16)
-def augmented_model(model: Model) -> AugmentedModel:
+def augmented_model(model: Model, *, discrepancies: bool = True) -> AugmentedModel:
     """The model with unmodelled accelerations, and input gain and bias discrepancies.
 
     Parameters
     ----------
     model : Model
+    discrepancies : bool, optional
+        Whether it has input gain and bias discrepancies.
 
     Returns
     -------
@@ -76,7 +75,7 @@ def augmented_model(model: Model) -> AugmentedModel:
     """
     derived, own = model.kinematics is None, model.rate_names
     latent = [f"unmodelled_{n}" for n in own]
-    discrepancies = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)]
+    gains = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)] if discrepancies else []
 
     def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
         motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own)]
@@ -85,8 +84,10 @@ def augmented_model(model: Model) -> AugmentedModel:
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
         coordinates, velocities, accelerations, applied, parameters = arguments(q, v, a, u, p)
         modelled = accelerations - _stacked(p, latent)
-        forces = ca.reshape(_stacked(p, discrepancies), model.n_u + 1, model.n_v).T @ ca.vertcat(1, applied)
-        return list(ca.vertsplit(model.residual(coordinates, velocities, modelled, applied, parameters) - forces))
+        residuals = model.residual(coordinates, velocities, modelled, applied, parameters)
+        if discrepancies:
+            residuals -= ca.reshape(_stacked(p, gains), model.n_u + 1, model.n_v).T @ ca.vertcat(1, applied)
+        return list(ca.vertsplit(residuals))
 
     def kinematics(q: Symbols, v: Symbols) -> list[object]:
         assert model.kinematics is not None
@@ -96,14 +97,14 @@ def augmented_model(model: Model) -> AugmentedModel:
         f"{model.name}, augmented",
         model.coordinates,
         model.inputs,
-        {**model.parameters, **{n: Parameter("") for n in (*discrepancies, *latent)}},
+        {**model.parameters, **{n: Parameter("") for n in (*gains, *latent)}},
         equations,
         velocities=None if derived else model.velocities_of_motion,
         kinematics=None if derived else kinematics,
         first_order=model.first_order,
         sensors=model.sensors_of(arguments),
     )
-    return AugmentedModel(augmented, model.n_p, model.n_v, model.n_u)
+    return AugmentedModel(augmented, model.n_p, model.n_v, len(gains))
 
 
 def _stacked(symbols: Symbols, names: Iterable[str]) -> ca.SX:

@@ -142,9 +142,9 @@ class _Slope:
 class Scores:
     """Score tests at a fit: of errors one by one, or estimates of several together."""
 
-    def __init__(self, intervals: ShootingIntervals, fit: Fit) -> None:
+    def __init__(self, intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> None:
         self.intervals, self.fit = intervals, fit
-        self.weights = weights_of(intervals, fit)
+        self.weights = weights_of(intervals, fit) if weights is None else weights
         self.at = linearize(intervals, fit, self.weights)
 
     @cached_property
@@ -284,16 +284,24 @@ class JointEquations:
     score: FloatArray
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> JointEquations:
-        """Equations at a fit, with its own weights.
+    def of(
+        cls,
+        intervals: ShootingIntervals,
+        fit: Fit,
+        kinds: Sequence[ErrorKind],
+        weights: FloatArray | None = None,
+    ) -> JointEquations:
+        """Equations at a fit.
 
         Parameters
         ----------
         intervals : ShootingIntervals
         fit : Fit
         kinds : sequence of ErrorKind
+        weights : (N, n_s) array, optional
+            Of the measurements; None: those of the fit, as `weights_of`.
         """
-        scores = Scores(intervals, fit)
+        scores = Scores(intervals, fit, weights)
         slopes = [scores.slope(x) for x in kinds]
 
         def stacked(values: list[FloatArray], like: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.simulation.compiler import order_statistics, padded_rows
 
-__all__ = ["Mixture", "lower_scale"]
+__all__ = ["Mixture", "NoiseSums", "lower_scale"]
 
 
 # A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
@@ -28,6 +28,48 @@ _FRACTION = (0.002, 0.95)
 _ROWS_AT_A_TIME = 4096
 # Sigmas from which on exp(-x^2 / 2) is 0 in double precision.
 _FAR = 40.0
+
+
+@dataclass(frozen=True)
+class NoiseSums:
+    """Sufficient statistics of the noise of each signal; those of disjoint samples add.
+
+    Parameters
+    ----------
+    weight : (n_s,) array
+        Sum of the probabilities that a sample is not an outlier.
+    squares : (n_s,) array
+        Sum of the squared residuals with these weights, each signal's unit squared.
+    count : (n_s,) array
+        Number of samples.
+    """
+
+    weight: FloatArray
+    squares: FloatArray
+    count: FloatArray
+
+    @classmethod
+    def of(cls, residuals: FloatArray, known: BoolArray, inlying: FloatArray) -> NoiseSums:
+        """Sums over samples.
+
+        Parameters
+        ----------
+        residuals : (N, n_s) array
+        known : (N, n_s) bool array
+            Samples that are measured.
+        inlying : (N, n_s) array
+            Result of `Mixture.inlying`.
+        """
+        weight = np.einsum("ni->i", inlying)
+        return cls(weight, np.einsum("ni,ni,ni->i", inlying, residuals, residuals), known.sum(axis=0).astype(float))
+
+    def plus(self, other: NoiseSums, weight: float = 1.0) -> NoiseSums:
+        """These sums and others, with a weight of the latter."""
+        return NoiseSums(
+            self.weight + weight * other.weight,
+            self.squares + weight * other.squares,
+            self.count + weight * other.count,
+        )
 
 
 @dataclass(frozen=True)
@@ -129,17 +171,28 @@ class Mixture:
         -------
         Mixture
         """
-        weight = np.einsum("ni->i", inlying)
-        squares = np.einsum("ni,ni,ni->i", inlying, residuals, residuals)
-        variance = squares / np.maximum(weight, 1e-9)
+        return self.of_sums(NoiseSums.of(residuals, known, inlying), outliers=outliers)
+
+    def of_sums(self, sums: NoiseSums, *, outliers: bool = True) -> Mixture:
+        """The M step from sufficient statistics; see `updated`.
+
+        Parameters
+        ----------
+        sums : NoiseSums
+        outliers : bool, optional
+
+        Returns
+        -------
+        Mixture
+        """
+        variance = sums.squares / np.maximum(sums.weight, 1e-9)
         for four in self.quaternions:
             columns = list(four)
-            variance[columns] = 4.0 / 3.0 * squares[columns].sum() / max(weight[columns].sum(), 1e-9)
+            variance[columns] = 4.0 / 3.0 * sums.squares[columns].sum() / max(sums.weight[columns].sum(), 1e-9)
         sigma = np.sqrt(variance)
         sigma = np.maximum(np.maximum(sigma, _SHRINK * self.sigma), self.floor)
-        count = known.sum(axis=0)
-        pi = np.clip(1.0 - weight / np.maximum(count, 1), *_FRACTION)
-        seen = count >= _FEWEST
+        pi = np.clip(1.0 - sums.weight / np.maximum(sums.count, 1), *_FRACTION)
+        seen = sums.count >= _FEWEST
         pi = np.where(seen & outliers, pi, self.pi)
         return replace(self, sigma=np.where(seen, sigma, self.sigma), pi=pi)
 

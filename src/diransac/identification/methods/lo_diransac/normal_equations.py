@@ -8,7 +8,8 @@ discrepancies), twice the cost is
     sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2
         + |s - m|^2 / prior^2
 
-The second sum is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
+and where a fit begins with a window of a log, that of its `BoundaryPrior`, which includes ``e_0``.  The second sum
+is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
 ``e_w`` is ``(d_w - rho d_{w-1}) / sqrt(1 - rho^2)``, and ``d_w`` where a log begins.
 
 References
@@ -27,6 +28,7 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
     from diransac.identification.methods.lo_diransac.mixture import Mixture
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
@@ -77,6 +79,8 @@ class Fit:
         Size of the discrepancies; prior standard deviation of the parameters, infinite without one.
     prior_mean : (n_s,) array
         Prior means of the parameters; zero for the others.
+    boundary : BoundaryPrior, optional
+        What is known from before the first interval; None where nothing is.
     """
 
     shared: FloatArray
@@ -90,6 +94,7 @@ class Fit:
     continuity_std: FloatArray
     prior: FloatArray
     prior_mean: FloatArray
+    boundary: BoundaryPrior | None = None
 
     def jumps(self, intervals: ShootingIntervals) -> FloatArray:
         """States at the intervals' starts less the ends of the intervals before, (W - 1, n_x); 0 where unlinked."""
@@ -118,6 +123,9 @@ class NormalEquations:
         shared unknowns of its log.
     precision : (W - 1, n_x) array
         Of the jumps.
+    corners, rights : (W, n, n) and (W, n) array
+        Information and right-hand side of the shared unknowns of each interval's log, from its measurements and its
+        end.
     """
 
     weights: FloatArray
@@ -129,6 +137,8 @@ class NormalEquations:
     jumps: FloatArray
     slopes: FloatArray
     precision: FloatArray
+    corners: FloatArray
+    rights: FloatArray
 
     def excess(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> FloatArray:
         """Jumps ``(W - 1, n_x)`` after a step, less those that these equations expect, from the step of a fit alone.
@@ -227,11 +237,21 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     g[:, n_x:k] -= deviation
     g[:-1, n_x:k] += rho * deviation[1:]
     beforehand = 1.0 / np.square(fit.prior)
-    border, corner, right = _shared_blocks(intervals, H[:, :k, k:], H[:, k:, k:], g[:, k:])
-    blocks = (H[:, :k, :k], E, border, corner + np.diag(beforehand))
-    system = Arrowhead(*blocks, _FINE_RIDGE) if len(intervals.layout.with_prior) else Arrowhead(*blocks)
+    corners, rights = H[:, k:, k:], g[:, k:]
+    border, corner, right = _shared_blocks(intervals, H[:, :k, k:], corners, rights)
+    corner = corner + np.diag(beforehand)
     right = right - beforehand * (fit.shared - fit.prior_mean)
-    return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, jumps, F, precision)
+    if fit.boundary is not None:
+        known, pull = fit.boundary.information, fit.boundary.right(fit)
+        H[0, :k, :k] += known[:k, :k]
+        border[0] += known[:k, k:]
+        corner += known[k:, k:]
+        g[0, :k] += pull[:k]
+        right += pull[k:]
+    blocks = (H[:, :k, :k], E, border, corner)
+    has_prior = fit.boundary is not None or len(intervals.layout.with_prior)
+    system = Arrowhead(*blocks, _FINE_RIDGE) if has_prior else Arrowhead(*blocks)
+    return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, jumps, F, precision, corners, rights)
 
 
 def variances_of_intervals(
@@ -342,8 +362,12 @@ def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     Returns
     -------
     (W, n_v) array
+        Infinite of those whose prior is that of the boundary.
     """
-    return np.where(intervals.following[:, None], fit.tau * np.sqrt(1.0 - np.square(fit.rho)), fit.tau)
+    std = np.where(intervals.following[:, None], fit.tau * np.sqrt(1.0 - np.square(fit.rho)), fit.tau)
+    if fit.boundary is not None:
+        std[0] = np.inf
+    return std
 
 
 def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
@@ -399,6 +423,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
         np.square(fit.jumps(intervals) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
+        0.0 if fit.boundary is None else fit.boundary.cost(fit),
     )
     total = float(sum(terms))
     return total if np.isfinite(total) else np.inf

@@ -32,8 +32,14 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
     cost,
     innovation_std,
-    innovations,
     with_residuals,
+)
+from diransac.identification.methods.lo_diransac.scales import (
+    SHRINK,
+    most_probable_size,
+    negligible_jumps,
+    process_sums,
+    unbroken_jumps,
 )
 from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
@@ -45,25 +51,21 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-__all__ = ["Prior", "Refinement", "diverges", "make_prior", "refine", "refine_exact", "start"]
+__all__ = [
+    "Prior", "Refinement", "Step", "diverges", "gauss_newton_step", "linearized", "make_prior", "refine",
+    "refine_exact", "start",
+]  # fmt: skip
 
 
-# Where tau starts, in spreads of the accelerations; the largest change of any scale in a step.
-_TAU_START, _SHRINK = 0.3, 0.4
-# Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
-_CONTINUITY = 0.03
+# Where tau starts, in spreads of the accelerations.
+_TAU_START = 0.3
 _SIGMA_FLOOR = 1e-5
 # Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
 _LEAST_PRIOR = 1e-6
 # Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT = 1e-3
-# Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
-# the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
-_UNBROKEN = 0.01
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
-# Correlation of unmodelled accelerations from interval to interval at most.
-_MOST_ALIKE = 0.98
 _MAX_TRIALS, _MAX_SWEEPS = 8, 12
 # Part of what is left of the excess of its cost when a step is corrected for the curvature of the rollouts, at most.
 _CORRECTED = 0.3
@@ -275,16 +277,16 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     TimeLimitError
         The time limit was reached.
     """
-    damping, converged, steps, at = 0.0, False, 0, _linearized(intervals, fit)
+    damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
-        taken = _step(intervals, fit, at, damping)
+        taken = gauss_newton_step(intervals, fit, at, damping)
         intervals, solved, damping = taken.intervals, taken.solved, taken.damping
         updated = _update(settings, intervals, taken.fit, solved, prior)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(fit, updated, errors)
-        fit, at = updated, _linearized(intervals, updated)
+        fit, at = updated, linearized(intervals, updated)
     return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
 
 
@@ -318,24 +320,24 @@ def refine_exact(
     shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
     tau = _NEARLY_EXACT * prior.tau
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-    fit = with_residuals(intervals, replace(fit, continuity_std=_continuity(intervals, tau)))
+    fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    at, losses = _linearized(intervals, fit), list[float]()
+    at, losses = linearized(intervals, fit), list[float]()
     while steps < settings.max_steps and not converged and not _is_lost(intervals, losses, settings, rival):
         check_time()
         steps += 1
-        taken = _step(intervals, fit, at, damping)
+        taken = gauss_newton_step(intervals, fit, at, damping)
         intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
         losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * fit.tau)
-        jumps = np.clip(_unbroken(fit, solved), _continuity(intervals, least), jumps) if steps == 1 else jumps
+        jumps = np.clip(unbroken_jumps(fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
         continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
         settled = bool((tau == fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
         converged = settled and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
-        fit, at = updated, _linearized(intervals, updated)
+        fit, at = updated, linearized(intervals, updated)
     return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
 
 
@@ -348,9 +350,9 @@ def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: Lo
     return bool(losses[-1] - rival > intervals.known.sum() + left * best)
 
 
-def _linearized(intervals: ShootingIntervals, fit: Fit) -> JointEquations:
-    """Normal equations at a fit, with its own weights."""
-    return JointEquations.of(intervals, fit, intervals.all_errors.kinds)
+def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> JointEquations:
+    """Normal equations at a fit, with its own weights unless there are others; see `JointEquations.of`."""
+    return JointEquations.of(intervals, fit, intervals.all_errors.kinds, weights)
 
 
 def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> float:
@@ -371,8 +373,21 @@ def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> flo
 
 
 @dataclass(frozen=True)
-class _Step:
-    """Intervals and fit after a step, its solution, next damping, and largest change of an error over its std."""
+class Step:
+    """Step of a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        After the step.
+    solved : Factored
+        Its solution.
+    damping : float
+        Of the next step.
+    of_errors : float
+        Largest change of an error of the recordings over its standard error.
+    """
 
     intervals: ShootingIntervals
     fit: Fit
@@ -381,8 +396,21 @@ class _Step:
     of_errors: float
 
 
-def _step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> _Step:
-    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls."""
+def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> Step:
+    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    at : JointEquations
+        Result of `linearized`.
+    damping : float
+
+    Returns
+    -------
+    Step
+    """
     weights = at.of_fit.weights
     before = cost(intervals, fit, weights)
     for _ in range(_MAX_TRIALS):
@@ -396,12 +424,12 @@ def _step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: f
             more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
                 least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
-                return _Step(there, trial, step.of_fit, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
+                return Step(there, trial, step.of_fit, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
             if not more < _CORRECTED * excess:
                 break
             right, excess = at.corrected(there, fit, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return _Step(intervals, fit, step.of_fit, damping, 0.0)
+    return Step(intervals, fit, step.of_fit, damping, 0.0)
 
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
@@ -428,36 +456,13 @@ def _update(
     """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
     inlying = fit.noise.inlying(fit.residuals, intervals.known)
     noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
-    squares, determined, rho = _process(intervals, fit, solved, prior.tau)
-    tau = _size(prior.tau, fit.tau, squares, determined)
+    sums = process_sums(intervals, fit, solved).total()
+    tau, rho = sums.most_probable_size(prior.tau, fit.tau), sums.correlation(prior.tau)
     if not settings.model_error:
-        tau = np.maximum(_SHRINK * fit.tau, 1e-3 * prior.tau)
-    continuity = np.maximum(_continuity(intervals, tau), _SHRINK * fit.continuity_std)
-    sizes = _discrepancies(fit, prior, np.diag(solved.var_p), intervals.n_p)
+        tau = np.maximum(SHRINK * fit.tau, 1e-3 * prior.tau)
+    continuity = np.maximum(negligible_jumps(intervals, tau), SHRINK * fit.continuity_std)
+    sizes = _discrepancies(fit, prior, np.diag(solved.var_p), intervals.n_p) if intervals.discrepancies else fit.prior
     return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity, prior=sizes)
-
-
-def _process(
-    intervals: ShootingIntervals, fit: Fit, solved: Factored, expected: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Squares of the innovations in the unit of tau, the number of those that the logs determine, and the new rho."""
-    n_x, linked = fit.x.shape[1], intervals.linked[:, None]
-    variance, common = solved.var_z[:, n_x:], solved.var_below[:, n_x:]
-    spread = variance.copy()
-    spread[1:] += np.where(linked, fit.rho * (fit.rho * variance[:-1] - 2.0 * common), 0.0)
-    determined = (1.0 - spread / np.square(innovation_std(intervals, fit))).sum(axis=0).clip(0.0)
-    second = np.square(fit.d) + variance
-    product = np.where(linked, fit.d[1:] * fit.d[:-1] + common, 0.0).sum(axis=0)
-    size = np.where(linked, 0.5 * (second[1:] + second[:-1]), 0.0).sum(axis=0)
-    rho = (product / (size + np.square(expected))).clip(0.0, _MOST_ALIKE)
-    squares = np.square(fit.tau) * np.square(innovations(intervals, fit)).sum(axis=0)
-    return squares, determined, rho
-
-
-def _size(expected: FloatArray, now: FloatArray, squares: FloatArray, determined: FloatArray) -> FloatArray:
-    """Size of discrepancies from the sum of their squares and the number of them that the logs determine."""
-    size = np.sqrt((squares + np.square(expected)) / (determined + 1.0))
-    return np.asarray(np.clip(size, _SHRINK * now, now / _SHRINK))
 
 
 def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> FloatArray:
@@ -465,23 +470,8 @@ def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> Fl
     sizes, unit, now = fit.prior.copy(), prior.unit[n_p:], fit.prior[n_p:]
     squares = np.square(fit.shared[n_p:] / unit).sum()
     determined = (1.0 - variance[n_p:] / np.square(now)).clip(0.0).sum()
-    sizes[n_p:] = unit * _size(np.array(prior.discrepancy), now[0] / unit[0], squares, determined)
+    sizes[n_p:] = unit * most_probable_size(squares, determined, prior.discrepancy, now[0] / unit[0])
     return sizes
-
-
-def _continuity(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
-    """Jumps ``(n_x,)`` that are negligible beside the effect of unmodelled accelerations on the state."""
-    T = intervals.duration
-    velocity = _CONTINUITY * tau * T
-    n_q, derived = intervals.model.n_q, intervals.model.kinematics is None
-    coordinate = velocity[:n_q] * T if derived else np.full(n_q, velocity.max() * T)
-    return np.concatenate([coordinate, velocity])
-
-
-def _unbroken(fit: Fit, solved: Factored) -> FloatArray:
-    """Jumps ``(n_x,)`` that are negligible beside the uncertainty of the states, over all intervals together."""
-    variance = solved.var_z[:, : fit.x.shape[1]]
-    return np.asarray(_UNBROKEN * np.sqrt(np.median(variance, axis=0).clip(0.0) / len(fit.x)))
 
 
 def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:

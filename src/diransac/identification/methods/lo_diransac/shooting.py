@@ -67,6 +67,8 @@ class ShootingIntervals:
         Errors of which ``measured`` is corrected, and with which the inputs act.
     threads : int, optional
         Threads of the simulations with derivatives.
+    discrepancies : bool, optional
+        Whether the model is augmented by input gain and bias discrepancies.
     """
 
     model: Model
@@ -83,6 +85,7 @@ class ShootingIntervals:
     hold: str = "zero-order"
     errors: RecordingErrors | None = None
     threads: int = 1
+    discrepancies: bool = True
 
     @classmethod
     def of(
@@ -188,7 +191,7 @@ class ShootingIntervals:
     @cached_property
     def augmented(self) -> AugmentedModel:
         """The model with its discrepancies."""
-        return augmented_model(self.model)
+        return augmented_model(self.model, discrepancies=self.discrepancies)
 
     @property
     def n_p(self) -> int:

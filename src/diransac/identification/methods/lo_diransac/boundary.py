@@ -1,0 +1,122 @@
+"""What is known when a window of a log begins: a Gaussian of its first unknowns and of the shared ones.
+
+Intervals that have left a window are marginalised: the Schur complement of their block of the normal equations remains
+as a prior of the state and the unmodelled accelerations at the start of the interval that follows, and of the shared
+unknowns.  It is kept as a square root of its information, so that it stays positive semidefinite and may know nothing
+of some directions, with the point of its linearisation: twice its cost at y = (x_0, d_0, s) is
+
+    |R (y - y_0) - b|^2
+
+References
+----------
+Sibley, Matthies, Sukhatme 2010 (sliding window filter); Bierman 1977 (square-root information, process noise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+
+__all__ = ["BoundaryPrior"]
+
+# Part of the largest eigenvalue, of information that is scaled to a diagonal of one, that rounding leaves of none.
+_ROUNDING = 1e-14
+# Part of an unknown that the information must determine.
+_SURE = 1e-3
+
+
+@dataclass(frozen=True)
+class BoundaryPrior:
+    """Gaussian of the unknowns at the start of a window.
+
+    Parameters
+    ----------
+    point : (n,) array
+        y_0: state and unmodelled accelerations of the first interval, then the shared unknowns.
+    root : (r, n) array
+        R, a square root of the information.
+    offset : (r,) array
+        b.
+    """
+
+    point: FloatArray
+    root: FloatArray
+    offset: FloatArray
+
+    @classmethod
+    def of_information(cls, point: FloatArray, information: FloatArray, right: FloatArray) -> BoundaryPrior:
+        """The Gaussian with an information matrix and minus the gradient of its cost at a point.
+
+        Parameters
+        ----------
+        point : (n,) array
+        information : (n, n) array
+            Symmetric, positive semidefinite up to rounding.
+        right : (n,) array
+        """
+        own = np.diag(information)
+        scale = 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0))
+        values, vectors = np.linalg.eigh(0.5 * (information + information.T) * np.outer(scale, scale))
+        kept = values > _ROUNDING * values[-1]
+        roots, columns = np.sqrt(values[kept]), vectors[:, kept]
+        return cls(point, (columns * roots).T / scale, columns.T @ (scale * right) / roots)
+
+    @property
+    def information(self) -> FloatArray:
+        """Information matrix ``(n, n)``."""
+        return self.root.T @ self.root
+
+    def marginal_of(self, index: int) -> tuple[float, float]:
+        """Mean and variance of one unknown; the variance is infinite where nothing is known of it."""
+        size = np.linalg.norm(self.root, axis=0)
+        scale = 1.0 / np.where(size > 0.0, size, 1.0)
+        inverse = scale[:, None] * np.linalg.pinv(self.root * scale)
+        known = float(inverse[index] @ self.root[:, index])
+        variance = float(np.square(inverse[index]).sum()) if known > 1.0 - _SURE else np.inf
+        return float(self.point[index] + inverse[index] @ self.offset), variance
+
+    def right(self, fit: Fit) -> FloatArray:
+        """Minus half the gradient of twice the cost, ``(n,)``, at a fit."""
+        return self.root.T @ self._deviation(fit)
+
+    def cost(self, fit: Fit) -> float:
+        """Twice the cost at a fit."""
+        return float(np.square(self._deviation(fit)).sum())
+
+    def _deviation(self, fit: Fit) -> FloatArray:
+        return self.offset - self.root @ (boundary_unknowns(fit) - self.point)
+
+    def faded(self, weight: float) -> BoundaryPrior:
+        """The Gaussian with its information multiplied by a weight."""
+        factor = np.sqrt(weight)
+        return replace(self, root=factor * self.root, offset=factor * self.offset)
+
+    def diffused(self, change: FloatArray) -> BoundaryPrior:
+        """The Gaussian after random changes of the last unknowns.
+
+        Parameters
+        ----------
+        change : (m, r) array
+            Square root of the covariance of the changes of the last m unknowns: shared ones, which unmodelled
+            accelerations may precede.
+
+        Returns
+        -------
+        BoundaryPrior
+        """
+        by_change = self.root[:, len(self.point) - len(change) :] @ change
+        factor = np.linalg.cholesky(np.eye(len(self.root)) + by_change @ by_change.T)
+        solved = np.linalg.solve(factor, np.column_stack([self.root, self.offset]))
+        return replace(self, root=solved[:, :-1], offset=solved[:, -1])
+
+
+def boundary_unknowns(fit: Fit) -> FloatArray:
+    """State and unmodelled accelerations at the start of a fit, and the shared unknowns, as one vector ``(n,)``."""
+    return np.concatenate([fit.x[0], fit.d[0], fit.shared])

@@ -1,0 +1,18 @@
+"""Parameters of a machine while it runs.
+
+| file | content |
+|---|---|
+| `tracker.py` | `Tracker` and `track`: samples in, estimates out |
+| `estimates.py` | `TrackedEstimate`, `Change` |
+| `stream.py` | samples on the grid of their clock; gaps, restarts, late and repeated ones |
+| `setup.py` | the problem, and intervals of a stream |
+| `starting.py`, `cold_start.py` | the first window, and a start by the default method |
+| `window.py`, `marginal.py` | the fit of the last intervals, and what remains of those before |
+| `changes.py` | steps and drifts of parameters |
+| `sensors.py` | sensors that stop |
+"""
+
+from diransac.identification.tracking.estimates import Change, TrackedEstimate
+from diransac.identification.tracking.tracker import Tracker, track
+
+__all__ = ["Change", "TrackedEstimate", "Tracker", "track"]

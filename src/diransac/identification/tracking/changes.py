@@ -1,0 +1,235 @@
+"""Changes of the parameters while a machine runs: when one is declared, what follows, and when it is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from diransac.arrays import FloatArray, IntArray
+from diransac.identification.tracking.drift import Drift
+from diransac.identification.tracking.estimates import Change
+from diransac.identification.tracking.forces import explanations_by_forces, with_forces
+from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
+
+if TYPE_CHECKING:
+    from diransac.identification.tracking.setup import Setup
+    from diransac.identification.tracking.window import Linearization, Window
+
+__all__ = ["Changes"]
+
+# Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
+_MEMORY, _AS_EXPECTED = 60.0, 20.0
+# Change of a parameter that is expected of a machine, over the parameter.
+_USUAL_CHANGE = 1.0
+# Standard error of the value after a change, over the change, with which it is reported; standard errors within
+# which a parameter has returned to an earlier value.
+_DETERMINED, _RETURNED = 0.1, 3.0
+# Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
+_REMEMBERED, _MOST_AGES = 32, 32
+# Kind of a change that goes on, in `ChangeTests`.
+_RAMP = 1
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A change that is not yet determined well enough to be reported."""
+
+    index: int
+    time: float
+    before: float
+    before_error: float
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """A change that explains a window: its evidence, kind, age, parameter, size, and the shift of all before it."""
+
+    evidence: float
+    kind: int = 0
+    age: int = 0
+    index: int = 0
+    size: float = 0.0
+    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+class Changes:
+    """Tests of changes, the drift of parameters, and the honesty of their standard errors.
+
+    Parameters
+    ----------
+    setup : Setup
+    step : float
+        Time between estimates, s.
+    false_alarms_per_hour : float
+    drift : mapping of str to float
+        As of `Tracker`.
+    """
+
+    def __init__(self, setup: Setup, step: float, false_alarms_per_hour: float, drift: Mapping[str, float]) -> None:
+        self.names = tuple(setup.model.parameters)
+        self.step, self.false_alarms = step, false_alarms_per_hour
+        self.drift = Drift(self.names, drift)
+        shape = (2, _MOST_AGES, len(self.names))
+        self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
+        self._usual: FloatArray | None = None
+        self._full = False
+        self._before = np.full(len(self.names), np.inf)
+        self._anchor, self._since = np.zeros((2, len(self.names))), np.zeros(len(self.names))
+        self._is_said = np.zeros(len(self.names), bool)
+        self._pending: list[_Pending] = []
+        self._reported: list[Change] = []
+        self._new: list[Change] = []
+
+    def before_step(self, window: Window) -> None:
+        """Let the parameters drift for a step, before the window."""
+        window.diffuse(np.sqrt(self.drift.rate * self.step))
+
+    def after_step(self, window: Window, found: Linearization) -> None:
+        """Test for changes, release a parameter that has changed, and report what is determined."""
+        of_calm = with_forces(found, *self._usual_forces(window))
+        tests = change_tests(of_calm, ages_of(len(window)))
+        self._full |= len(window) == window.most
+        if not self._full or self._gain(tests, self._scatter(tests), found.fit.shared).max() < self._price(tests.ages):
+            self._learn(window, tests)
+        else:
+            self._decide(window, of_calm, tests)
+        self._report(window)
+        self._follow_drift(window)
+
+    def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
+        """Size and correlation ``(n_v,)`` of the unmodelled accelerations from before the window.
+
+        They follow those of the fit with a delay of a window, so that a change which unmodelled accelerations seem to
+        explain is tested against those that the machine usually has.
+        """
+        now = np.stack([np.log(window.fit.tau), window.fit.rho])
+        self._usual = now if self._usual is None else self._usual
+        self._usual = self._usual + min(1.0, self.step / self._duration(window)) * (now - self._usual)
+        return np.exp(self._usual[0]), self._usual[1]
+
+    def _duration(self, window: Window) -> float:
+        """Duration of the window, s."""
+        return len(window) * window.length * window.stream.dt
+
+    def _price(self, ages: IntArray) -> float:
+        """Evidence, nats, that a change must gain: the logarithm of the number of tests between two false alarms.
+
+        Of one age, as many tests are independent as fit into an hour without overlapping.
+        """
+        per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
+        return float(np.log(per_hour / self.false_alarms))
+
+    def _scatter(self, tests: ChangeTests) -> FloatArray:
+        """Variance ``(2, A, n)`` of the ratios of the tests that is remembered; 1 at least."""
+        places = self._places(tests)
+        return np.asarray(np.maximum(self._squares[:, places] / self._counts[:, places], 1.0))
+
+    def _places(self, tests: ChangeTests) -> IntArray:
+        """Places ``(A,)`` of the ages in what is remembered; the last one is that of the whole window."""
+        return np.array([*range(len(tests.ages) - 1), _MOST_AGES - 1])
+
+    def _learn(self, window: Window, tests: ChangeTests) -> None:
+        """Remember the scatter of the tests, and what they tell of the drift."""
+        if self._pending or len(window) < window.most:
+            return
+        faded, weight = np.exp(-self.step / _MEMORY), 1.0 / tests.ages[None, :, None]
+        seen = weight * np.square(tests.ratio), weight * (tests.information > 0.0)
+        places = self._places(tests)
+        for sums, new in zip((self._squares, self._counts), seen, strict=True):
+            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + new
+        T = self._duration(window)
+        size, information = tests.size[0, -1], tests.information[0, -1]
+        self.drift.learn(window.fit.shared, size, information, T, self.step / T)
+
+    def _gain(self, tests: ChangeTests, scatter: FloatArray, values: FloatArray) -> FloatArray:
+        """Logarithms ``(2, A, n)`` of the Bayes factors of the changes, as eq. (8) of `docs/method.md`."""
+        information = tests.information / scatter
+        prior = np.square(_USUAL_CHANGE * values) * information
+        ratio = np.square(tests.size) * information
+        return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
+
+    # ------------------------------------------------------------------ a change
+
+    def _decide(self, window: Window, found: Linearization, tests: ChangeTests) -> None:
+        """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
+        best, without = _Explanation(-np.inf), -np.inf
+        for scaled, evidence in explanations_by_forces(found, window.expected):
+            without = max(without, evidence)
+            fine = change_tests(scaled, fine_ages_of(len(window)))
+            gain = evidence + self._gain(fine, np.ones_like(fine.size), found.fit.shared)
+            if gain.max() > best.evidence:
+                kind, age, index = (int(x) for x in np.unravel_index(np.argmax(gain), gain.shape))
+                size, shift = float(fine.size[kind, age, index]), fine.shift[kind, age, index]
+                best = _Explanation(float(gain.max()), kind, int(fine.ages[age]), index, size, size * shift)
+        if best.evidence - without < self._price(tests.ages) or best.kind == _RAMP:
+            self._learn(window, tests)
+            return
+        first = len(window) - best.age
+        time = float(window.times[first])
+        value, error = window.release(first, best.index, found.fit.shared + best.shift, best.size)
+        self._pending = [x for x in self._pending if x.index != best.index]
+        self._pending.append(_Pending(best.index, time, value, error))
+
+    def _report(self, window: Window) -> None:
+        """Report the changes that are determined, and forget those that have turned out to be none."""
+        errors, now = np.sqrt(np.diag(self.covariance(window))), window.times[-1] + window.length * window.stream.dt
+        significant = self._significant(window)
+        for one in list(self._pending):
+            after, error = float(window.fit.shared[one.index]), float(errors[one.index])
+            change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
+            settled = abs(after - self._before[one.index]) < error < _DETERMINED * change
+            if settled and change > significant * both:
+                self._pending.remove(one)
+                self._say(one, after, error, float(now))
+            elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
+                self._pending.remove(one)
+        self._before = window.fit.shared
+
+    def _follow_drift(self, window: Window) -> None:
+        """Report each drift once, when a parameter has moved further than chance moves it."""
+        now = float(window.times[-1] + window.length * window.stream.dt)
+        values, errors = window.fit.shared, np.sqrt(np.diag(self.covariance(window)))
+        still = ~self.drift.drifting | np.isin(np.arange(len(values)), [x.index for x in self._pending])
+        self._since = np.where(still, now, self._since)
+        self._anchor = np.where(still, [values, errors], self._anchor)
+        self._is_said &= ~still
+        moved = np.abs(values - self._anchor[0]) > self._significant(window) * np.hypot(errors, self._anchor[1])
+        for k in np.flatnonzero(moved & ~self._is_said):
+            before, before_error = self._anchor[:, k].tolist()
+            one = _Pending(int(k), float(self._since[k]), before, before_error)
+            self._say(one, float(values[k]), float(errors[k]), now, "drift")
+            self._is_said[k] = True
+
+    def _significant(self, window: Window) -> float:
+        """Standard errors of a change that chance gives as seldom as the false alarms."""
+        return float(np.sqrt(2.0 * self._price(ages_of(len(window)))))
+
+    def _say(
+        self, one: _Pending, after: float, error: float, now: float, kind: Literal["step", "drift"] = "step"
+    ) -> None:
+        """Report a change, as a return where it ends at a value from before an earlier one."""
+        name = self.names[one.index]
+        earlier = [x for x in self._reported if x.parameter == name]
+        back = any(abs(after - x.before) < _RETURNED * np.hypot(error, x.before_error) for x in earlier)
+        found: Literal["step", "drift", "return"] = "return" if back else kind
+        change = Change(one.time, name, one.before, after, found, now, one.before_error, error)
+        self._reported = [*self._reported, change][-_REMEMBERED:]
+        self._new.append(change)
+
+    def covariance(self, window: Window) -> FloatArray:
+        """Covariance of the parameters at the end of the window.
+
+        It includes their drift during the window, and is larger where windows scatter more than their covariances.
+        """
+        assert window.last is not None
+        drift = np.diag(self.drift.rate * self._duration(window) / 3.0)
+        more = np.sqrt(np.maximum(self._squares[0, -1] / self._counts[0, -1], 1.0))
+        return np.asarray((window.last.solved.var_p + drift) * np.outer(more, more))
+
+    def taken(self) -> tuple[Change, ...]:
+        """Changes since the last call."""
+        new, self._new = tuple(self._new), []
+        return new

@@ -1,0 +1,84 @@
+"""Weights of samples that a window does not expect.
+
+A machine that changes contradicts the model, and a mixture takes samples that contradict a model for outliers: the
+change would hide itself.  Where the last intervals have more outliers than their signals usually have, outliers are
+those of a motion that follows the samples instead, with unmodelled accelerations as large as the accelerations
+themselves.  Real outliers contradict this motion, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.normal_equations import weights_of
+from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.tracking.window import Window
+
+__all__ = ["is_surprised", "weights_of_free_motion"]
+
+# Standard deviations of the number of outliers that are a surprise; and the intervals in which they are counted.
+_SURPRISE, _LAST = 4.0, 2
+# Time that the motion is followed, s, and steps until its outliers are found.
+_FOLLOWED, _STEPS = 1.0, 4
+# Standard deviation of parameters that are held, over their values.
+_HELD = 1e-6
+
+
+def is_surprised(window: Window) -> bool:
+    """True if the last intervals of a window have more outliers than chance gives them."""
+    rows = slice(-_LAST * window.length, None)
+    intervals, fit = window.intervals(), window.fit
+    known = intervals.known[rows]
+    found = (known - fit.noise.inlying(fit.residuals[rows], known)).sum()
+    expected = (known * fit.noise.pi).sum()
+    variance = (known * fit.noise.pi * (1.0 - fit.noise.pi)).sum()
+    return bool(found > expected + _SURPRISE * np.sqrt(variance + 1.0))
+
+
+def weights_of_free_motion(window: Window) -> FloatArray:
+    """Weights ``(N, n_s)`` of all samples of a window, those of the last second by a motion that follows them.
+
+    Parameters
+    ----------
+    window : Window
+
+    Returns
+    -------
+    (N, n_s) array
+    """
+    n = min(len(window), round(_FOLLOWED / (window.length * window.stream.dt)))
+    whole = window.fit
+    rows = slice(-n * window.length, None)
+    intervals = window.setup.intervals(window.stream, window.end - n * window.length, n)
+    fit = replace(
+        whole,
+        x=whole.x[-n:],
+        d=whole.d[-n:],
+        residuals=whole.residuals[rows],
+        ends=whole.ends[-n:],
+        tau=window.spread,
+        rho=np.zeros_like(whole.rho),
+        prior=_HELD * np.maximum(np.abs(whole.shared), _HELD),
+        prior_mean=whole.shared,
+        boundary=None,
+    )
+    weights = weights_of(window.intervals(), whole)
+    weights[rows] = weights_of(intervals, _followed(intervals, fit))
+    return weights
+
+
+def _followed(intervals: ShootingIntervals, fit: Fit) -> Fit:
+    """The fit after some steps with scales that are held."""
+    damping = 0.0
+    for _ in range(_STEPS):
+        taken = gauss_newton_step(intervals, fit, linearized(intervals, fit), damping)
+        fit, damping = taken.fit, taken.damping
+    return fit

@@ -1,0 +1,301 @@
+"""The sliding window: the joint fit of the last intervals, given what those before them have told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.mixture import NoiseSums
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.scales import (
+    ProcessSums,
+    effect_on_state,
+    negligible_jumps,
+    process_sums,
+    unbroken_jumps,
+)
+from diransac.identification.tracking.forces import gain_of_freedom
+from diransac.identification.tracking.marginal import marginal
+from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.arrowhead import Factored
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.tracking.setup import Setup
+    from diransac.identification.tracking.stream import Stream
+
+__all__ = ["Linearization", "Window"]
+
+# Steps at most with another interval; one that moves no parameter by more than so many standard errors is the last.
+_MOST_STEPS, _SETTLED = 3, 0.1
+# Time over which noise, unmodelled accelerations, and parameters of a model that is not exact are remembered after the
+# window, s: a minute of a sensor at 1 Hz still gives its noise to 10 %.
+_MEMORY = 60.0
+# Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
+_EXACT = 1e-6
+# Part of the spread of a signal from which on its noise leaves nothing to explain; as in `search`.
+_ALL_OF_IT = 0.8
+# Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
+_AS_LIKELY = 5.0
+# Standard deviation of a parameter of which nothing is known after a change, over the parameter.
+_FREE = 10.0
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Normal equations of a window, the fit that they are of, and their solution.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    at : NormalEquations
+    solved : Factored
+    """
+
+    intervals: ShootingIntervals
+    fit: Fit
+    at: NormalEquations
+    solved: Factored
+
+
+class Window:
+    """Fit of the intervals of a window; changes as it moves on.
+
+    Parameters
+    ----------
+    setup : Setup
+    stream : Stream
+        Holds the rows of the window.
+    first : int
+        First row of the window.
+    fit : Fit
+        Of its intervals.
+    spread : (n_signals,) array
+        Of the signals, as in `Motion`.
+    most : int
+        Number of intervals of the window once it is full.
+    """
+
+    def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
+        self.most = most
+        self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
+        self.spread = spread[fit.x.shape[1] : fit.x.shape[1] + fit.d.shape[1]]
+        self._n_hopeless = 0
+        self.least, self.expected = _EXACT * self.spread, setup.settings.prior_model_error * self.spread
+        n = len(fit.x)
+        self.length = stream.length // setup.parts
+        self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
+        none = np.zeros_like(fit.noise.sigma)
+        self.noise = NoiseSums(none, none, none)
+        self.sizes, self.weight = np.zeros_like(fit.tau), 0.0
+        self.process, self.freedom = ProcessSums.none(len(fit.tau)), 0.0
+        self._found, self._gained = np.square(fit.tau), np.inf
+        self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
+        self.last: Linearization | None = None
+
+    def __len__(self) -> int:
+        return len(self.fit.x)
+
+    @property
+    def end(self) -> int:
+        """Row after the last one of the window."""
+        return self.first + len(self) * self.length
+
+    def intervals(self) -> ShootingIntervals:
+        """The intervals with their rows as they are now."""
+        return self.setup.intervals(self.stream, self.first, len(self))
+
+    # ------------------------------------------------------------------ moving on
+
+    def extend(self, n: int) -> None:
+        """Add intervals that continue the last one."""
+        for _ in range(n):
+            fit = self.fit
+            x, d = np.vstack([fit.x, fit.ends[-1:]]), np.vstack([fit.d, fit.rho * fit.d[-1:]])
+            self._append(replace(fit, x=x, d=d), 1)
+
+    def join(self, x: FloatArray) -> None:
+        """Add intervals of a new stretch that begin with given states ``(n, n_x)``."""
+        fit = self.fit
+        d = np.zeros((len(x), fit.d.shape[1]))
+        self._append(replace(fit, x=np.vstack([fit.x, x]), d=np.vstack([fit.d, d])), len(x))
+
+    def _append(self, fit: Fit, n: int) -> None:
+        """The fit with n more intervals, whose residuals are simulated."""
+        self.times = np.append(self.times, self.stream.time(self.end) + self.length * self.stream.dt * np.arange(n))
+        self.fit = fit
+        residuals, ends = self.intervals().simulated(fit.shared, fit.x, fit.d, np.arange(len(fit.x) - n, len(fit.x)))
+        self.fit = replace(fit, residuals=np.vstack([fit.residuals, residuals]), ends=np.vstack([fit.ends, ends]))
+
+    def leave(self, n: int) -> None:
+        """Marginalise the first n intervals; their sums of noise and unmodelled accelerations are remembered."""
+        assert self.last is not None
+        intervals, now, at = self.last.intervals, self.last.fit, self.last.at
+        boundary = marginal(at, intervals, now, n)
+        rows = n * self.length
+        self._remember(intervals, now, n)
+        fit = self.fit
+        kept = {name: getattr(fit, name)[n:] for name in ("x", "d", "ends")}
+        self.fit = replace(fit, residuals=fit.residuals[rows:], boundary=boundary, **kept)
+        if not self.is_exact:  # errors of a model do not average out as noise does
+            self.fit = replace(self.fit, boundary=boundary.faded(self.kept**n))
+        self.first, self.times = self.first + rows, self.times[n:]
+
+    def diffuse(self, std: FloatArray) -> None:
+        """Random changes of the parameters, of given standard deviations ``(n_p,)``, before the window."""
+        changing = np.flatnonzero(std)
+        if self.fit.boundary is not None and len(changing):
+            root = np.zeros((len(std), len(changing)))
+            root[changing, np.arange(len(changing))] = std[changing]
+            self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
+
+    def release(self, first: int, index: int, before: FloatArray, change: float) -> tuple[float, float]:
+        """Begin the window anew where a parameter has changed, of which nothing is known from then on.
+
+        Parameters
+        ----------
+        first : int
+            Interval with which the change begins.
+        index : int
+            Of the parameter.
+        before : (n_p,) array
+            Parameters before the change.
+        change : float
+            Its size.
+
+        Returns
+        -------
+        float, float
+            The parameter before the change, and its standard error.
+        """
+        whole = self.fit
+        fit, value, error = self._fit_before(first, index, before)
+        shared, rows = fit.shared.copy(), first * self.length
+        shared[index] += change
+        assert fit.boundary is not None
+        # The change may be within the interval before or after, whose motion is then that of neither.
+        free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
+        free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
+        boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
+        self.first, self.times = self.first + rows, self.times[first:]
+        self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
+        self.fit = with_residuals(self.intervals(), self.fit)
+        self.optimise()
+        return value, error
+
+    def _fit_before(self, first: int, index: int, before: FloatArray) -> tuple[Fit, float, float]:
+        """The fit of the intervals before one of the window, as a boundary of that, with a parameter and its error."""
+        if not first:
+            boundary = self.fit.boundary
+            assert boundary is not None
+            mean, variance = boundary.marginal_of(len(boundary.point) - len(before) + index)
+            shared = before.copy()
+            shared[index] = mean
+            return replace(self.fit, shared=shared), mean, float(np.sqrt(variance))
+        whole = self.intervals()
+        is_before = np.arange(len(whole.measured)) < first * self.length
+        intervals = replace(whole, sampled=whole.sampled & is_before[:, None])
+        fit, damping = with_residuals(intervals, replace(self.fit, shared=before)), 0.0
+        for _ in range(_MOST_STEPS):
+            at = linearized(intervals, fit)
+            taken = gauss_newton_step(intervals, fit, at, damping)
+            fit, damping = taken.fit, taken.damping
+        boundary = marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
+        error = float(np.sqrt(taken.solved.var_p[index, index]))
+        return replace(fit, boundary=boundary), float(fit.shared[index]), error
+
+    # ------------------------------------------------------------------ the fit
+
+    def optimise(self) -> Linearization:
+        """Steps of the fit and of its scales from the state of the window; the first linearisation."""
+        intervals = self.intervals()
+        weights = weights_of_free_motion(self) if is_surprised(self) else None
+        first: Linearization | None = None
+        damping = 0.0
+        for _ in range(_MOST_STEPS):
+            at = linearized(intervals, self.fit, weights)
+            before = self.fit
+            taken = gauss_newton_step(intervals, before, at, damping)
+            # Damping is no information.
+            solved = at.step(at.right).of_fit if damping or taken.damping else taken.solved
+            damping = taken.damping
+            self.last = Linearization(intervals, before, at.of_fit, solved)
+            self.fit = self._with_scales(intervals, taken.fit, solved)
+            first = first or self.last
+            moved = np.abs(taken.fit.shared - before.shared)
+            if (moved <= _SETTLED * np.sqrt(np.diag(solved.var_p))).all():
+                break
+        assert first is not None
+        assert self.last is not None
+        self._gained = gain_of_freedom(self.last, self.least, self.expected)
+        self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
+        return first
+
+    @property
+    def is_hopeless(self) -> bool:
+        """True if the fit has explained nothing in as many steps as the window has intervals."""
+        return self._n_hopeless >= self.most
+
+    def _explains_nothing(self, intervals: ShootingIntervals) -> bool:
+        """True if noise or unmodelled accelerations are as large as the signals themselves."""
+        seen = intervals.known.any(axis=0)
+        noise = (self.fit.noise.sigma > _ALL_OF_IT * self._spread)[seen].all()
+        return bool(noise or (self.fit.tau > self.spread).any())
+
+    def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
+        """The fit with its scales, from the window and what is remembered."""
+        inlying = fit.noise.inlying(fit.residuals, intervals.known)
+        noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.noise))
+        process = process_sums(intervals, fit, solved).total()
+        size = process.likeliest_size(fit.tau)
+        self._found = np.square(size)
+        tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
+        rho = np.zeros_like(tau) if self.is_exact else process.plus(self.process).correlation(self.expected)
+        continuity = np.maximum(negligible_jumps(intervals, tau), unbroken_jumps(fit, solved))
+        return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity)
+
+    @property
+    def is_exact(self) -> bool:
+        """True unless unmodelled accelerations are likelier, in the window and in the last minute before it."""
+        return self.freedom + self._gained < _AS_LIKELY
+
+    def _usual_size(self) -> FloatArray:
+        """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
+        usual = np.sqrt(self.sizes / self.weight) if self.weight else np.zeros_like(self.expected)
+        return np.asarray(np.maximum(usual, self.expected))
+
+    def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
+        """Add the sums of the first n intervals to those that are remembered, which fade."""
+        assert self.last is not None
+        rows = slice(n * self.length)
+        residuals, known = fit.residuals[rows], intervals.known[rows]
+        faded = self.kept**n
+        sums = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
+        self.noise = sums.plus(self.noise, faded)
+        self.sizes, self.weight = faded * self.sizes + n * self._found, faded * self.weight + n
+        process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
+        self.process = process.plus(self.process, faded)
+        self.freedom = faded * self.freedom + n / len(intervals) * self._gained
+
+    # ------------------------------------------------------------------ what it tells
+
+    def outliers(self, signals: list[tuple[str, int]]) -> dict[str, float]:
+        """Fraction of the samples of some signals, by name and column, that are outliers."""
+        assert self.last is not None
+        known = self.last.intervals.known
+        inlying = self.fit.noise.inlying(self.fit.residuals, known).sum(axis=0)
+        return {name: float(1.0 - inlying[k] / known[:, k].sum()) for name, k in signals}
+
+    def last_state(self) -> dict[str, float]:
+        """Most probable state in the last row."""
+        assert self.last is not None
+        intervals, fit, last = self.last.intervals, self.fit, np.array([len(self) - 1])
+        series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d, last))
+        state = self.setup.model.state
+        return dict(zip(state, series[0, -1, : len(state)].tolist(), strict=True))

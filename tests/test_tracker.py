@@ -1,0 +1,266 @@
+"""The tracker: the batch fit's answer, changes, hostile streams.  Its flights are simulated by plain NumPy."""
+
+import tracemalloc
+from functools import cache
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from diransac.errors import LogError, SettingsError
+from simulated import ROTORCRAFT, VEHICLE, as_log, flight, rotorcraft_acceleration, with_outliers
+
+DT = 0.01
+MODEL = dr.models.planar_rotorcraft()
+ROUGH = {"mass": 0.3, "inertia": 0.005, "drag": 0.02}
+NOISE = np.array([0.005, 0.005, 0.01, 0.02, 0.02, 0.05])
+
+
+@cache
+def flown(n_rows, seed=0, *, outliers=0.1, gust=0.0, gust_from=0.0, change=None):
+    """Log of a flight: ``change = (time, parameter, factor)``; gusts are Gauss-Markov accelerations of 1 s."""
+    rng = np.random.default_rng(seed)
+    x, force, states, inputs = np.array(ROTORCRAFT.start), np.zeros(3), np.empty((n_rows, 6)), np.empty((n_rows, 2))
+    kept = np.exp(-DT)
+    for row in range(n_rows):
+        t, truth = row * DT, dict(ROTORCRAFT.truth)
+        if change is not None and t >= change[0]:
+            truth[change[1]] *= change[2]
+        if t >= gust_from:
+            force = kept * force + gust * np.sqrt(1.0 - kept**2) * rng.normal(size=3) * [1.0, 1.0, 0.0]
+        u, p = np.array(ROTORCRAFT.law(t + seed, x[:3], x[3:])), list(truth.values())
+
+        def rate(x, u=u, p=p, force=force):
+            return np.concatenate([x[3:], np.array(rotorcraft_acceleration(x[:3], x[3:], u, p)) + force])
+
+        states[row], inputs[row] = x, u
+        k1 = rate(x)
+        k2 = rate(x + DT / 2.0 * k1)
+        k3 = rate(x + DT / 2.0 * k2)
+        x = x + DT / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(x + DT * k3))
+    signals = with_outliers(states + rng.normal(size=states.shape) * NOISE, outliers, 5.0, seed + 1)
+    columns = dict(zip(ROTORCRAFT.signals, signals.T, strict=False)) | dict(
+        zip(ROTORCRAFT.inputs, inputs.T, strict=True)
+    )
+    return dr.Log.from_arrays(np.arange(n_rows) * DT, columns)
+
+
+def columns_of(log):
+    return {"t": log.time.copy(), **{name: log[name].copy() for name in log.names}}
+
+
+def fed(columns, size=10, **options):
+    """Estimates of a tracker that is fed some rows at a time."""
+    tracker = dr.Tracker(MODEL, background=False, **{"start": ROUGH, **options})
+    parts = ({n: x[k : k + size] for n, x in columns.items()} for k in range(0, len(columns["t"]), size))
+    return [now for part in parts if (now := tracker.update(part)) is not None]
+
+
+def ratios(now, truth=ROTORCRAFT.truth):
+    """Errors of an estimate over their standard errors."""
+    return np.array([(now.parameters[n] - x) / now.standard_errors[n] for n, x in truth.items()])
+
+
+# ---------------------------------------------------------------------- the batch fit
+
+
+@pytest.mark.parametrize("window", [5.0, 15.0])
+def test_tracker_ends_with_the_answer_of_the_batch_fit_on_an_exact_log(window):
+    signals, inputs = flight(VEHICLE, 1000, DT, substeps=5)
+    rng = np.random.default_rng(0)
+    signals = signals + rng.normal(size=signals.shape) * 0.02 * signals.std(axis=0)
+    signals[:, 2] = np.nan
+    log, model = as_log(VEHICLE, signals, inputs, DT), dr.models.underwater_vehicle()
+    log = dr.Log.from_arrays(log.time, {n: log[n] for n in ("x", "x_dot", "thrust")})
+    batch = dr.identify(model, log, dr.LoDiransac(suggestions=False))
+    start = {"mass": 50.0, "linear_drag": 20.0, "quadratic_drag": 30.0, "bias": 1.0}
+    *_, now = dr.track(model, log, window=window, start=start)
+    for name, value in batch.parameters.items():
+        assert abs(now.parameters[name] - value) < 0.1 * batch.standard_errors[name]
+        assert now.standard_errors[name] == pytest.approx(batch.standard_errors[name], rel=0.2)
+
+
+def test_estimates_are_honest_with_outliers_and_noise():
+    *_, now = dr.track(MODEL, flown(700, 3), start=ROUGH)
+    assert np.abs(ratios(now)).max() < 3.5
+    assert all(low < now.parameters[n] < high for n, (low, high) in now.intervals(0.95).items())
+    assert now.outliers["x"] == pytest.approx(0.1, abs=0.05)
+    assert now.noise["theta_dot"] == pytest.approx(0.05, rel=0.1)
+    assert now.time == pytest.approx(6.99)
+    assert now.state["z"] == pytest.approx(np.median(flown(700, 3, outliers=0.0)["z"][-3:]), abs=0.02)
+    assert np.allclose(np.sqrt(np.diag(now.covariance)), list(now.standard_errors.values()))
+
+
+# ---------------------------------------------------------------------- changes
+
+
+@pytest.mark.parametrize(
+    ("change", "gust", "seed", "delay"),
+    [((8.0, "mass", 1.3), 0.0, 0, 1.0), ((8.04, "inertia", 1.3), 0.3, 1, 1.5)],
+)
+def test_step_of_a_parameter_is_reported_once_when_its_value_is_known(change, gust, seed, delay):
+    log = flown(1000, seed, gust=gust, change=change)
+    changes = [x for now in dr.track(MODEL, log, start=ROUGH) for x in now.changes]
+    assert [(x.parameter, x.kind) for x in changes] == [(change[1], "step")]
+    truth = ROTORCRAFT.truth[change[1]]
+    assert changes[0].time == pytest.approx(change[0], abs=0.15)
+    assert changes[0].detected < change[0] + delay
+    assert changes[0].before == pytest.approx(truth, abs=4.0 * changes[0].before_error)
+    assert changes[0].after == pytest.approx(change[2] * truth, rel=0.1)
+
+
+def test_estimate_follows_a_step_at_once():
+    *_, now = dr.track(MODEL, flown(1000, 0, change=(8.0, "mass", 1.3)), start=ROUGH)
+    assert now.parameters["mass"] == pytest.approx(1.3 * 0.249, rel=2e-3)
+    assert now.parameters["inertia"] == pytest.approx(0.004, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("gust", "gust_from"), [(0.3, 0.0), (0.5, 8.0)])
+def test_gusts_and_outliers_are_no_changes(gust, gust_from):
+    log = flown(1800, 2, gust=gust, gust_from=gust_from)
+    assert [x for now in dr.track(MODEL, log, start=ROUGH) for x in now.changes] == []
+
+
+def test_change_since_an_identification_is_reported():
+    result = dr.identify(MODEL, flown(800, 9), dr.LoDiransac(suggestions=False, sources=()))
+    log = flown(700, 4, change=(-1.0, "mass", 1.3))
+    changes = [x for now in dr.track(MODEL, log, start=result) for x in now.changes]
+    assert [x.parameter for x in changes] == ["mass"]
+    assert changes[0].before == result.parameters["mass"]
+    assert changes[0].after == pytest.approx(1.3 * 0.249, rel=0.01)
+
+
+# ---------------------------------------------------------------------- streams
+
+
+def test_answer_does_not_depend_on_how_samples_are_handed_over():
+    log = flown(400)
+    whole = list(dr.track(MODEL, log, start=ROUGH, window=2.0))
+    for size in (1, 7, 400):
+        parts = fed(columns_of(log), size, window=2.0)
+        assert parts[-1].parameters == whole[-1].parameters
+        assert (parts[-1].covariance == whole[-1].covariance).all()
+    assert [now.time for now in fed(columns_of(log), 1, window=2.0)] == [now.time for now in whole]
+
+
+def test_missing_late_and_repeated_samples_are_taken():
+    rng = np.random.default_rng(0)
+    order = np.repeat(np.argsort(np.arange(800) + rng.uniform(0.0, 3.0, 800)), 1 + (rng.random(800) < 0.05))
+    columns = {n: x[order] for n, x in columns_of(flown(800)).items()}
+    for name in ("x", "theta", "z_dot"):
+        columns[name][rng.random(len(order)) < 0.3] = np.nan
+    end = fed(columns)[-1]
+    assert np.abs(ratios(end)).max() < 4.0
+    assert end.time == pytest.approx(7.95, abs=0.06)
+
+
+def test_sensor_that_comes_a_second_late_counts():
+    columns = columns_of(flown(600, outliers=0.0))
+    tracker, last = dr.Tracker(MODEL, start=ROUGH), None
+    for k in range(600):
+        last = tracker.update({n: x[k] for n, x in columns.items() if n != "x"}) or last
+        if k >= 100:
+            last = tracker.update({"t": columns["t"][k - 100], "x": columns["x"][k - 100]}) or last
+    assert last.noise["x"] == pytest.approx(0.005, rel=0.15)
+    assert np.abs(ratios(last)).max() < 4.0
+
+
+def test_gap_and_restart_of_the_clock_are_said_and_change_nothing():
+    columns = columns_of(flown(900))
+    kept = (columns["t"] < 3.0) | (columns["t"] > 5.0)
+    gap = fed({n: x[kept] for n, x in columns.items()})
+    assert [x for now in gap for x in now.notes] == ["a gap of 2.02 s after t = 2.99 s"]
+    assert np.abs(ratios(gap[-1])).max() < 4.0
+    columns["t"][500:] -= columns["t"][500]
+    restarted = fed(columns)
+    assert [x for now in restarted for x in now.notes] == ["the clock restarts at t = 0 s, after t = 4.99 s"]
+    assert np.abs(ratios(restarted[-1])).max() < 4.0
+    assert restarted[-1].time == pytest.approx(3.99, abs=0.1)
+
+
+def test_single_wrong_stamp_is_left_out():
+    columns = columns_of(flown(500))
+    columns["t"][300] = 1e9
+    found = fed(columns)
+    assert [x for now in found for x in now.notes] == []
+    assert found[-1].time == pytest.approx(4.99)
+
+
+def test_sensor_that_stops_is_said():
+    columns = columns_of(flown(700))
+    columns["x"][300:550] = np.nan
+    notes = [x for now in fed(columns) for x in now.notes]
+    assert [x.partition(",")[0] for x in notes] == ["x is not measured any more", "x is measured again"]
+
+
+def test_jittered_clock_keeps_its_rate():
+    columns = columns_of(flown(900, outliers=0.0))
+    columns["t"] += np.random.default_rng(0).uniform(-0.1, 0.1, 900) * DT
+    assert np.abs(ratios(fed(columns)[-1])).max() < 5.0
+
+
+# ---------------------------------------------------------------------- starts
+
+
+@pytest.mark.slow
+def test_cold_start_and_recovery_from_a_wrong_start_end_alike():
+    log = flown(900)
+    cold = list(dr.track(MODEL, log))
+    wrong = list(dr.track(MODEL, log, start={"mass": 0.01, "inertia": 1e-5, "drag": 5.0}))
+    assert "identified" in cold[0].notes[0]
+    assert any("identified anew" in x for now in wrong for x in now.notes)
+    for now in (cold[-1], wrong[-1]):
+        assert np.abs(ratios(now)).max() < 4.0
+
+
+def test_memory_does_not_grow():
+    columns = columns_of(flown(700))
+    tracker = dr.Tracker(MODEL, start=ROUGH, window=1.0)
+    tracker.update({n: x[:400] for n, x in columns.items()})
+    tracemalloc.start()
+    tracker.update({n: x[400:500] for n, x in columns.items()})
+    before = tracemalloc.get_traced_memory()[0]
+    tracker.update({n: x[500:] for n, x in columns.items()})
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert after < before + 50_000
+
+
+# ---------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"window": 0.0}, "window is 0.0; give a number above 0"),
+        ({"step": float("nan")}, "step is nan"),
+        ({"window": 0.1}, "at least two steps"),
+        ({"false_alarms_per_hour": "often"}, "false_alarms_per_hour is 'often'"),
+        ({"start": {"weight": 1.0}}, 'start names "weight"; the parameters are mass, inertia, drag'),
+        ({"start": {"mass": 1.0}}, 'start lacks "inertia"'),
+        ({"start": {"mass": float("inf")}}, 'start of "mass" is inf'),
+        ({"drift": {"weight": 1.0}}, 'drift names "weight"'),
+    ],
+)
+def test_bad_argument_is_refused_in_one_sentence(options, message):
+    with pytest.raises(SettingsError, match=message):
+        dr.Tracker(MODEL, **options)
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        ({"x": 1.0}, 'samples have no time; give their column "t" in seconds'),
+        ({"t": np.nan}, "is not finite"),
+        ({"t": [0.0, 0.1], "x": [1.0]}, '"x" has 1 samples, the time has 2'),
+        ({"t": 0.0, "x": "far"}, '"x" of the samples is .far.; give numbers'),
+        ({"t": [[0.0]]}, "the shape"),
+        (3.0, "samples are a float"),
+        ({"t": np.arange(100.0)}, "too slow for a step of 0.1 s"),
+        ({"t": np.zeros(2000)}, "stands still"),
+    ],
+)
+def test_bad_samples_are_refused_in_one_sentence(samples, message):
+    with pytest.raises(LogError, match=message):
+        dr.Tracker(MODEL, start=ROUGH).update(samples)
