@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -28,13 +28,15 @@ from diransac.cli.options import (
 from diransac.cli.outputs import PAGE, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.tracking import Summary, TrackTable, as_line, followed, to_dict, tracked
-from diransac.data.readers.growing import Growing
 from diransac.errors import LogError
 from diransac.identification.result import Result
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking import TrackedEstimate, Tracker, track
 from diransac.identification.tracking.history import History
 from diransac.model import Model
+
+if TYPE_CHECKING:
+    from diransac.data.readers.growing import Growing
 
 __all__ = ["app"]
 
