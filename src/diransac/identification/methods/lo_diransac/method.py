@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -203,8 +203,9 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         check_signs(dataset, rows_of_logs(intervals, motion))
     parts, candidates, lacks = compared_parts(likeliest, result), None, None
     if settings.suggestions:
-        candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
-        lacks = None if likeliest.exact else missing_terms(candidates)
+        with suppress(np.linalg.LinAlgError):  # squares of tiny or huge numbers, of which no term can be tested
+            candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
+            lacks = None if likeliest.exact else missing_terms(candidates)
     ambiguity = _ambiguity(parts.changes, lacks, len(result.parameters))
     checks = (
         *_checks(settings, best),
