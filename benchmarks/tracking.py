@@ -8,6 +8,8 @@ values, which are a tenth off, and give estimates every .1 s:
 
 error
     RMS over time of the relative error of each parameter, from 10 s on, without the 5 s after a step;
+answered
+    estimates, over the intervals of .1 s that have samples; other measures are those of the estimates there are;
 coverage
     fraction of the 95 % intervals, of all judged parameters and all times from 10 s on, that hold the truth;
 delay
@@ -122,10 +124,12 @@ def judged(flight: Flight, machine: Machine, scenario: Scenario, moments: Sequen
         held.append(np.abs(values - truth)[late] <= 1.96 * stds[late])
         if scenario.factor(name, np.array([CHANGE]))[0] != 1.0:
             delays[name] = _delay(t, np.abs(off) < NEAR)
+    n_steps = np.count_nonzero(np.diff(np.floor(flight.columns["t"] / STEP)))
     reports = [(x.time, name, since) for x in moments for name, since in x.changes]
     seconds = np.array([x.seconds for x in moments])
     return {
         "errors": errors,
+        "answered": len(moments) / n_steps,
         "coverage": float(np.mean(held)),
         "delays": delays,
         "reported": {name: _reported(reports, name) for name in delays},
@@ -191,7 +195,7 @@ def hour_of(seed: int) -> Row:
         if not len(moments) % round(WARM / STEP):
             memory.append(_memory())
     row = judged(flight, MACHINES["planar"], scenario, moments)
-    kept = ("errors", "coverage", "false", "reports", "rate", "latency", "worst")
+    kept = ("errors", "answered", "coverage", "false", "reports", "rate", "latency", "worst")
     about = {"machine": "planar", "scenario": "hour, gusts" if scenario.gusts else "hour", "method": "tracker"}
     grown = memory[-1] - memory[0] if memory else 0.0
     return about | {"seed": seed, "memory": memory, "grown": grown} | {name: row[name] for name in kept}
@@ -217,7 +221,17 @@ def _machine_table(rows: Sequence[Row], machine: str) -> str:
     if not own:
         return ""
     names = MACHINES[machine].judged
-    header = ["scenario", "method", "flights", *(f"{n}, %" for n in names), "coverage", "delay, s", "false", "rate, /s"]
+    header = [
+        "scenario",
+        "method",
+        "flights",
+        *(f"{n}, %" for n in names),
+        "answered",
+        "coverage",
+        "delay, s",
+        "false",
+        "rate, /s",
+    ]
     lines = [f"## {machine}", "", _line([*header, "latency, ms"]), _line(["---"] * (len(header) + 1))]
     for scenario, method in dict.fromkeys((row["scenario"], row["method"]) for row in own):
         group = [row for row in own if (row["scenario"], row["method"]) == (scenario, method)]
@@ -235,6 +249,7 @@ def _cells(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
     shown = [f"{np.mean(x):.1f}" for x in delays[: 1 + is_tracker] if x]
     return [
         *(x if x != "nan" else "" for x in errors),
+        f"{np.mean([row['answered'] for row in rows]):.2f}",
         f"{np.mean([row['coverage'] for row in rows]):.2f}",
         " (reported: ".join(shown) + (")" if len(shown) > 1 else ""),
         str(sum(row["false"] for row in rows)) if is_tracker else "",

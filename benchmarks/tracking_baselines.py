@@ -3,8 +3,8 @@
 ``ekf``, ``ukf``
     The parameters are states that walk at random: masses, inertias and coefficients as logarithms, which keeps them
     positive, biases as they are.  An attitude has three errors.  A sample beyond five standard deviations of its
-    innovation is not used, unless its sensor has been so for .3 s.  After a gap the state begins
-    anew, the parameters stay.
+    innovation is not used.  Where a sensor has been so for .3 s, and after a gap, the state begins anew, from robust
+    lines through .3 s of samples; the parameters stay.
 
 ``rls``
     Recursive least squares with forgetting.  Causal Hampel filter, then the same second-order low-pass filter on both
@@ -147,6 +147,7 @@ class KalmanFilter:
     def begin(self, rows: Columns) -> None:
         """Begin with a state from samples, the parameters as they are."""
         self._x, n = self._body.first(rows), self._n
+        self._refused[:] = 0.0
         self._P[:n, :] = self._P[:, :n] = 0.0
         self._P[:n, :n] = np.diag(self._body.first_std**2)
 
@@ -176,7 +177,7 @@ class KalmanFilter:
         innovation = self._body.aligned(y, predicted[0]) - predicted[0] - mean
         beyond = np.abs(innovation) > GATE * np.sqrt(np.diag(S))
         self._refused = np.where(np.isnan(y), self._refused, (self._refused + dt) * beyond)
-        used = np.flatnonzero(np.isfinite(innovation) & (~beyond | (self._refused > IMPATIENCE)))
+        used = np.flatnonzero(np.isfinite(innovation) & ~beyond)
         if not len(used):
             return
         gain = np.linalg.solve(S[np.ix_(used, used)], cross[:, used].T).T
@@ -184,6 +185,11 @@ class KalmanFilter:
         self._x, self._h = self._body.moved(self._x[None], step[None, : self._n])[0], self._h + step[self._n :]
         P = self._P - gain @ cross[:, used].T
         self._P = 0.5 * (P + P.T)
+
+    @property
+    def is_lost(self) -> bool:
+        """True where the samples of a sensor have been far from their predictions for long."""
+        return bool(self._refused.max() > IMPATIENCE)
 
     def estimates(self) -> tuple[dict[str, float], dict[str, float]]:
         """Values and standard errors of the parameters."""
@@ -207,16 +213,17 @@ def kalman(transform: Transform, tuning: Tuning) -> Method:
         dt = float(np.median(np.diff(t)))
         y = np.column_stack([flight.columns[name] for name in body.signals])
         u = np.column_stack([flight.columns[name] for name in body.inputs])
-        first = round(0.1 / dt)
-        found.begin(flight.rows(slice(first)))
-        due, begin = t[first] + step, time.process_time()
-        for k in range(first, len(t)):
+        since, n_first, due, begin = 0, round(IMPATIENCE / dt), t[0] + step, time.process_time()
+        for k in range(1, len(t)):
             apart = t[k] - t[k - 1]
-            if apart > RESTART:
-                found.begin(flight.rows(slice(k, k + first)))
-            for _ in range(round(apart / dt) if apart <= RESTART else 0):
-                found.predict(u[k - 1], dt)
-            found.correct(y[k], u[k], dt)
+            since = k if apart > RESTART else max(since, k - n_first) if found.is_lost else since
+            if k - since == n_first:
+                found.begin(flight.rows(slice(since, k + 1)))
+                since = -len(t)
+            elif since < 0:
+                for _ in range(round(apart / dt)):
+                    found.predict(u[k - 1], dt)
+                found.correct(y[k], u[k], dt)
             if t[k] >= due - 0.5 * dt:
                 now = time.process_time()
                 yield Moment(float(t[k]), *found.estimates(), now - begin)
@@ -320,6 +327,11 @@ class Regression(Protocol):
 
     def add(self, y: Mapping[str, float], *, settled: bool) -> None:
         """Take the filtered samples of a row, and the equations where the filters have settled."""
+
+    @property
+    def is_lost(self) -> bool:
+        """True where the samples of a sensor have been far from their predictions for long."""
+        return bool(self._refused.max() > IMPATIENCE)
 
     def estimates(self) -> tuple[dict[str, float], dict[str, float]]:
         """Values and standard errors of the parameters."""

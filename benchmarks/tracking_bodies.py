@@ -32,7 +32,7 @@ class Body(Protocol):
     """Density of the random accelerations that a filter assumes, (n_t,), relative to its tuning."""
 
     def first(self, rows: Columns) -> Array:
-        """State (n_x,) from the first samples."""
+        """State (n_x,) at the last of some rows, from robust lines through them."""
 
     def slope(self, x: Array, p: Columns, u: Array) -> Array:
         """Time derivatives (m, n_x) of states (m, n_x)."""
@@ -58,8 +58,17 @@ def advanced(body: Body, x: Array, p: Columns, u: Array, dt: float) -> Array:
     return x + dt / 6.0 * (first + 2.0 * second + 2.0 * third + body.slope(x + dt * third, p, u))
 
 
-def _medians(rows: Columns, names: Sequence[str]) -> list[float]:
-    return [float(np.nanmedian(rows[name])) for name in names]
+def _lines(rows: Columns, names: Sequence[str]) -> tuple[Array, Array]:
+    """Values at the last row and slopes of the lines of Theil and Sen through some columns."""
+    found = []
+    for name in names:
+        seen = np.isfinite(rows[name])
+        t, y = rows["t"][seen] - rows["t"][-1], rows[name][seen]
+        i, j = np.triu_indices(len(t), 1)
+        slope = np.median((y[j] - y[i]) / (t[j] - t[i]))
+        found.append((np.median(y - slope * t), slope))
+    values, slopes = np.array(found).T
+    return values, slopes
 
 
 class Planar:
@@ -69,13 +78,13 @@ class Planar:
     signals = ("x", "z", "theta", "theta_dot")
     inputs = ("thrust", "moment")
     noise = np.array([2e-3, 2e-3, 3e-3, 0.02])
-    first_std = np.array([0.02, 0.02, 0.02, 2.0, 2.0, 0.5])
+    first_std = np.array([0.02, 0.02, 0.02, 0.5, 0.5, 0.1])
     pushed = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 2.0])
 
     def first(self, rows: Columns) -> Array:
-        """Medians, without velocities."""
-        x, z, theta, rate = _medians(rows, self.signals)
-        return np.array([x, z, theta, 0.0, 0.0, rate])
+        """Pose and rate, and slopes of the position."""
+        (x, z, theta, rate), (x_dot, z_dot, *_) = _lines(rows, self.signals)
+        return np.array([x, z, theta, x_dot, z_dot, rate])
 
     def slope(self, x: Array, p: Columns, u: Array) -> Array:
         """Of position, then of velocity."""
@@ -118,22 +127,23 @@ class Quadrotor:
     signals = (*quad.GYRO, *quad.ACC, *quad.POSITION, *quad.ATTITUDE)
     inputs = quad.COMMANDS
     noise = np.repeat([quad.NOISE[kind] for kind in ("gyro", "acc", "position", "attitude")], (3, 3, 3, 4))
-    first_std = np.repeat([0.02, 2.0, 0.05, 0.5, 200.0], (3, 3, 3, 3, 4))
+    first_std = np.repeat([0.02, 0.5, 0.05, 0.2, 200.0], (3, 3, 3, 3, 4))
     pushed = np.repeat([0.0, 1.0, 0.0, 2.0, 0.0], (3, 3, 3, 3, 4))
 
     def __init__(self, thrust_coefficient: float) -> None:
         self.thrust_coefficient = thrust_coefficient
 
     def first(self, rows: Columns) -> Array:
-        """Medians, without velocity, the speeds at the commands."""
+        """Pose and rates, slopes of the position, the speeds at the commands."""
         found = np.zeros(17)
-        found[:3] = _medians(rows, quad.POSITION)
+        found[:3], found[3:6] = _lines(rows, quad.POSITION)
         attitudes = np.column_stack([rows[name] for name in quad.ATTITUDE])
-        seen = attitudes[np.isfinite(attitudes).all(axis=1)]
-        attitude = np.median(seen * np.sign(seen @ seen[0])[:, None], axis=0)
+        signs = np.sign(attitudes @ np.nan_to_num(attitudes[np.isfinite(attitudes).all(axis=1)][0]))
+        turned = {"t": rows["t"], **dict(zip(quad.ATTITUDE, (attitudes * signs[:, None]).T, strict=True))}
+        attitude, _ = _lines(turned, quad.ATTITUDE)
         found[6:10] = attitude / np.linalg.norm(attitude)
-        found[10:13] = _medians(rows, quad.GYRO)
-        found[13:] = _medians(rows, quad.COMMANDS)
+        found[10:13], _ = _lines(rows, quad.GYRO)
+        found[13:] = [rows[name][-1] for name in quad.COMMANDS]
         return found
 
     def slope(self, x: Array, p: Columns, u: Array) -> Array:

@@ -8,7 +8,7 @@ mass, inertias and the drag of the quadrotor seem to grow by the same factor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,11 +53,13 @@ class Scenario:
     gusts: bool = False
     gaps: bool = False
 
-    def factor(self, name: str, t: Array) -> Array:
-        """Value of a parameter, over that at the beginning, at times (n,)."""
+    def factor(self, name: str, t: Array, growing: Collection[str] = ()) -> Array:
+        """Value of a parameter, over that at the beginning, at times (n,); some seem to grow as thrust is lost."""
         kind = "inertia" if name.startswith("inertia") else name
         found = np.where(t >= CHANGE, STEP_FACTOR[kind], 1.0) if kind in self.steps else np.ones_like(t)
-        return found / (1.0 - LOSS * np.clip((t - CHANGE) / LOSS_DURATION, 0.0, 1.0)) if self.loss else found
+        if not self.loss or name not in growing:
+            return found
+        return found / (1.0 - LOSS * np.clip((t - CHANGE) / LOSS_DURATION, 0.0, 1.0))
 
 
 SCENARIOS = {
@@ -147,6 +149,7 @@ def _flight(
     beginning: Mapping[str, float],
     model: dr.Model,
     known: Mapping[str, float],
+    growing: Collection[str],
 ) -> Flight:
     """The flight of complete rows, less those in gaps."""
     t = columns["t"]
@@ -155,7 +158,7 @@ def _flight(
         kept = rng.random(len(t)) >= DROPPED
         for first, last in GAPS:
             kept &= (t < first) | (t >= last)
-    truth = {name: value * scenario.factor(name, t[kept]) for name, value in beginning.items()}
+    truth = {name: value * scenario.factor(name, t[kept], growing) for name, value in beginning.items()}
     off = {name: value * (1.0 + rng.choice([-0.1, 0.1])) for name, value in beginning.items() if "bias" not in name}
     start = {name: off.get(name, 0.0) for name in beginning}
     rows = {name: x[kept] for name, x in columns.items()}
@@ -165,6 +168,8 @@ def _flight(
 # ---------------------------------------------------------------------- planar rotorcraft
 PLANAR_NOISE = {"x": 2e-3, "z": 2e-3, "theta": 3e-3, "theta_dot": 0.02}
 PLANAR_OUTLIER = {"x": 1.0, "z": 1.0, "theta": 1.0, "theta_dot": 6.0}
+PLANAR_GROWING = ("mass", "inertia")
+"""Its drag is in proportion to the commanded thrust."""
 PLANAR_GUST = np.array([0.5, 0.5, 1.0])
 """Standard deviations, m/s^2 and rad/s^2."""
 
@@ -174,14 +179,14 @@ def fly_planar(scenario: Scenario, seed: int) -> Flight:
     rng, dt = np.random.default_rng([seed, 36]), 0.01
     beginning = {name: value * rng.uniform(0.9, 1.1) for name, value in ROTORCRAFT.truth.items()}
     t = dt * np.arange(round(scenario.duration / dt))
-    factors = np.column_stack([scenario.factor(name, t) for name in beginning])
+    factors = np.column_stack([scenario.factor(name, t, PLANAR_GROWING) for name in beginning])
     values = factors * list(beginning.values())
     gusts = _gust(rng, len(t), dt, PLANAR_GUST, on=scenario.gusts)
     states, inputs = _planar_motion(t, values, gusts, rng.uniform(0.0, 100.0))
     columns = {"t": t, **dict(zip(ROTORCRAFT.inputs, inputs.T, strict=True))}
     for name, place in zip(PLANAR_NOISE, (0, 1, 2, 5), strict=True):
         columns[name] = _read(states[:, place], PLANAR_NOISE[name], PLANAR_OUTLIER[name], rng, hit=scenario.outliers)
-    return _flight(scenario, rng, columns, beginning, dr.models.planar_rotorcraft(), {})
+    return _flight(scenario, rng, columns, beginning, dr.models.planar_rotorcraft(), {}, PLANAR_GROWING)
 
 
 def _planar_motion(t: Array, values: Array, gusts: Array, phase: float) -> tuple[Array, Array]:
@@ -210,6 +215,7 @@ def _runge_kutta(slope: Callable[[Array], Array], x: Array, dt: float) -> Array:
 # ---------------------------------------------------------------------- quadrotor
 QUAD_RATE, QUAD_POSE_EVERY, QUAD_STEP = 250, 5, 2e-3
 """Hz; rows from a pose to the next; step of the simulation, s, a twentieth of the lag of the motors."""
+QUAD_GROWING = ("mass", "inertia_x", "inertia_y", "inertia_z", "drag")
 QUAD_GUST = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 0.5])
 WEIGHT = np.array([0.0, 0.0, quad.G])
 KNOWN = "thrust_coefficient"
@@ -222,19 +228,13 @@ def fly_quadrotor(scenario: Scenario, seed: int) -> Flight:
     airframe = quad.airframe(rng)
     every = round(1.0 / QUAD_RATE / QUAD_STEP)
     fine = QUAD_STEP * np.arange(round(scenario.duration / QUAD_STEP))
-    values = {name: value * _quadrotor_factor(scenario, name, fine) for name, value in airframe.items()}
+    values = {name: value * scenario.factor(name, fine, QUAD_GROWING) for name, value in airframe.items()}
     gusts = _gust(rng, len(fine), QUAD_STEP, QUAD_GUST, on=scenario.gusts)
     states, commands, forces = _quadrotor_motion(fine, values, gusts, rng)
     columns = {"t": fine[::every], **dict(zip(quad.COMMANDS, commands[::every].T, strict=True))}
     columns |= _quadrotor_readings(states[::every], forces[::every], airframe, rng, hit=scenario.outliers)
     beginning = {name: x for name, x in airframe.items() if name != KNOWN}
-    return _flight(scenario, rng, columns, beginning, quadrotor.model(), {KNOWN: airframe[KNOWN]})
-
-
-def _quadrotor_factor(scenario: Scenario, name: str, t: Array) -> Array:
-    """As `Scenario.factor`; in a frame whose thrust is known, every inertia and drag grows as the thrust is lost."""
-    of_frame = name in ("mass", "drag") or name.startswith("inertia")
-    return scenario.factor(name, t) if of_frame else np.ones_like(t)
+    return _flight(scenario, rng, columns, beginning, quadrotor.model(), {KNOWN: airframe[KNOWN]}, QUAD_GROWING)
 
 
 def _quadrotor_motion(
