@@ -81,7 +81,6 @@ def _parts() -> dict[str, Part]:
         "finer intervals": Part(patches=(("local_search.fewest_parts", lambda _: 0),)),
         "second start of the exact model": Part(patches=(("local_search._APART", np.inf),)),
         "errors of recordings": Part(replace(DEFAULT, **off)),
-        "delays by whole samples": Part(patches=(("local_search.LocalSearch._late", lambda *_: 0.0),)),
         "errors must explain forces": Part(
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
         ),
@@ -100,6 +99,7 @@ def _parts() -> dict[str, Part]:
             patches=(("refinement._is_lost", lambda *_: False), ("local_search.Explanation.exact_is_hopeless", False))
         ),
         "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),
+        "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),
     }
 
 

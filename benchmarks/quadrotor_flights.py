@@ -12,6 +12,8 @@ import numpy as np
 import diransac as dr
 
 Array = np.ndarray
+Curve = tuple[Array, Array, Array]
+"""Amplitude, m, angular frequency, rad/s, and phase of each coordinate."""
 
 G, ARM = 9.81, 0.12
 STEP, CONTROL, RATE, POSE_RATE = 5e-4, 4, 500, 100
@@ -45,7 +47,7 @@ class Flight:
 def fly(seed: int, duration: float, late: float = 0.015, outliers: float = 0.05) -> Flight:
     """One flight of a quadrotor whose parameters, path and biases differ from seed to seed."""
     rng = np.random.default_rng([seed, 77])
-    truth = _airframe(rng)
+    truth = airframe(rng)
     time, states, commands, slopes = _flown(truth, rng, duration)
     every = round(1.0 / RATE / STEP)
     rows = np.arange(0, len(time), every)
@@ -54,10 +56,10 @@ def fly(seed: int, duration: float, late: float = 0.015, outliers: float = 0.05)
     readings = np.einsum("nji,nj->ni", R, slopes[rows, 3:6] + [0.0, 0.0, G])
     for names, kind, values in ((GYRO, "gyro", states[rows, 15:18]), (ACC, "acc", readings)):
         for name, value in zip(names, values.T, strict=True):
-            columns[name] = _read(value + truth[_bias(name)], kind, rng, outliers)
+            columns[name] = _read(value + truth[bias(name)], kind, rng, outliers)
     seen = np.clip(rows - round(late / STEP), 0, None)
     poses = states[seen]
-    attitudes = _quaternions(poses[:, 6:15].reshape(-1, 3, 3)) * rng.choice([-1.0, 1.0], (len(rows), 1))
+    attitudes = quaternions(poses[:, 6:15].reshape(-1, 3, 3)) * rng.choice([-1.0, 1.0], (len(rows), 1))
     apart = RATE // POSE_RATE
     for names, kind, values in ((POSITION, "position", poses[:, :3]), (ATTITUDE, "attitude", attitudes)):
         for name, value in zip(names, values.T, strict=True):
@@ -65,7 +67,8 @@ def fly(seed: int, duration: float, late: float = 0.015, outliers: float = 0.05)
     return Flight(dr.Log.from_arrays(time[rows], columns), truth, late)
 
 
-def _bias(reading: str) -> str:
+def bias(reading: str) -> str:
+    """Name of the parameter that is the bias of a reading."""
     sensor, axis = reading.split("_")
     return f"{sensor}_bias_{axis}"
 
@@ -77,7 +80,7 @@ def _read(values: Array, kind: str, rng: np.random.Generator, outliers: float) -
     return noisy + hit * rng.uniform(-OUTLIER[kind], OUTLIER[kind], len(values))
 
 
-def _airframe(rng: np.random.Generator) -> dict[str, float]:
+def airframe(rng: np.random.Generator) -> dict[str, float]:
     """Parameters of a small racing quadrotor, each within 15 %, and biases."""
     base = {
         "mass": 0.95,
@@ -90,11 +93,11 @@ def _airframe(rng: np.random.Generator) -> dict[str, float]:
         "motor_time_constant": 0.04,
     }
     drawn = {name: value * rng.uniform(0.85, 1.15) for name, value in base.items()}
-    drawn |= {_bias(name): rng.normal(0.0, 0.03) for name in GYRO}
-    return drawn | {_bias(name): rng.normal(0.0, 0.2) for name in ACC}
+    drawn |= {bias(name): rng.normal(0.0, 0.03) for name in GYRO}
+    return drawn | {bias(name): rng.normal(0.0, 0.2) for name in ACC}
 
 
-def _slope(x: Array, command: Array, p: dict[str, float]) -> Array:
+def slope(x: Array, command: Array, p: dict[str, float]) -> Array:
     """Derivative of position, velocity, rotation matrix, angular velocity and speeds of the rotors."""
     v, R, w, speeds = x[3:6], x[6:15].reshape(3, 3), x[15:18], x[18:]
     thrusts = p["thrust_coefficient"] * speeds**2
@@ -111,30 +114,38 @@ def _slope(x: Array, command: Array, p: dict[str, float]) -> Array:
 
 def _flown(p: dict[str, float], rng: np.random.Generator, duration: float) -> tuple[Array, Array, Array, Array]:
     """Time, states, commands and their derivatives at every step."""
-    size, rate = (
-        np.array([1.2, 1.2, 0.6]) * rng.uniform(0.7, 1.2, 3),
-        np.array([1.7, 1.9, 1.5]) * rng.uniform(0.8, 1.2, 3),
-    )
-    phase = rng.uniform(0.0, 6.28, 3)
-    hover = np.full(4, np.sqrt(p["mass"] * G / 4.0 / p["thrust_coefficient"]))
-    x = np.concatenate([size * np.sin(phase), np.zeros(3), np.eye(3).ravel(), np.zeros(3), hover])
-    n = round(duration / STEP)
+    curve = path(rng)
+    x, n = beginning(p, curve), round(duration / STEP)
     states, commands, slopes = np.empty((n, 22)), np.empty((n, 4)), np.empty((n, 22))
     for k in range(n):
         if k % CONTROL == 0:
-            command = _pilot(k * STEP, x, p, (size, rate, phase))
-        first = _slope(x, command, p)
+            command = pilot(k * STEP, x, p, curve)
+        first = slope(x, command, p)
         states[k], commands[k], slopes[k] = x, command, first
-        second = _slope(x + 0.5 * STEP * first, command, p)
-        third = _slope(x + 0.5 * STEP * second, command, p)
-        fourth = _slope(x + STEP * third, command, p)
+        second = slope(x + 0.5 * STEP * first, command, p)
+        third = slope(x + 0.5 * STEP * second, command, p)
+        fourth = slope(x + STEP * third, command, p)
         x = x + STEP / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
     return STEP * np.arange(n), states, commands, slopes
 
 
-def _pilot(t: float, x: Array, p: dict[str, float], path: tuple[Array, Array, Array]) -> Array:
+def path(rng: np.random.Generator) -> Curve:
+    """A random curve."""
+    size = np.array([1.2, 1.2, 0.6]) * rng.uniform(0.7, 1.2, 3)
+    rate = np.array([1.7, 1.9, 1.5]) * rng.uniform(0.8, 1.2, 3)
+    return size, rate, rng.uniform(0.0, 6.28, 3)
+
+
+def beginning(p: dict[str, float], curve: Curve) -> Array:
+    """State (22,) at rest on a curve, the rotors at the speed of hover."""
+    size, _, phase = curve
+    hover = np.full(4, np.sqrt(p["mass"] * G / 4.0 / p["thrust_coefficient"]))
+    return np.concatenate([size * np.sin(phase), np.zeros(3), np.eye(3).ravel(), np.zeros(3), hover])
+
+
+def pilot(t: float, x: Array, p: dict[str, float], curve: Curve) -> Array:
     """Commands of the motors that follow a curve with a swinging heading."""
-    size, rate, phase = path
+    size, rate, phase = curve
     R, w = x[6:15].reshape(3, 3), x[15:18]
     aim, speed = size * np.sin(rate * t + phase), size * rate * np.cos(rate * t + phase)
     wanted = 6.0 * (aim - x[:3]) + 4.0 * (speed - x[3:6]) - size * rate**2 * np.sin(rate * t + phase) + [0.0, 0.0, G]
@@ -151,7 +162,7 @@ def _pilot(t: float, x: Array, p: dict[str, float], path: tuple[Array, Array, Ar
     return np.sqrt(np.clip(thrusts, 0.05, 6.0) / p["thrust_coefficient"])
 
 
-def _quaternions(R: Array) -> Array:
+def quaternions(R: Array) -> Array:
     """Unit quaternions (n, 4), scalar part first, by the largest component of each."""
     trace = np.trace(R, axis1=1, axis2=2)
     squares = 0.25 * np.column_stack([1.0 + trace, *(1.0 - trace + 2.0 * R[:, i, i] for i in range(3))])

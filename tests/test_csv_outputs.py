@@ -23,6 +23,7 @@ LOGS = {
     "design": ["design", "swim.json", "--limit", "x=-3:3", "--limit", "thrust=80", "--duration", "4", "-o", "out.csv"],
 }
 TABLES = {
+    "track": ["track", "swim.csv", "--model", "swim.json", "--window", "1", "-o", "out.csv"],
     "study export": ["study", "export", "a.db", "--to", "csv", "-o", "out.csv"],
     "fleet export": ["fleet", "export", "fleet.db", "-o", "out.csv"],
 }

@@ -8,14 +8,15 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
+from diransac.identification.methods.lo_diransac import integration_steps
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
+from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
-from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, LocalSearch, fewest_parts
-from diransac.identification.methods.lo_diransac.missing_terms import short_windows
+from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
@@ -40,7 +41,7 @@ from diransac.identification.methods.lo_diransac.screening import (
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Samples, choose_half_widths, smooth
 from diransac.text_table import duration
-from simulated import MACHINES, flight, rollout
+from simulated import MACHINES, as_log, flight, rollout
 
 ROTORCRAFT = dr.models.planar_rotorcraft()
 TRUTH = np.array(list(MACHINES["planar-rotorcraft"].truth.values()))
@@ -256,6 +257,39 @@ def test_intervals_from_true_states_reproduce_the_log():
     shared = np.append(TRUTH, np.zeros(intervals.n_shared - 3))
     x, d = signals[intervals.starts, :6], np.zeros((len(intervals), 3))
     assert np.abs(intervals.simulated(shared, x, d)[0]).max() < 1e-11
+
+
+def at_truth(intervals, signals, noise):
+    """The fit of the true motion, with a noise of each signal, and no unmodelled accelerations."""
+    x, d = signals[intervals.starts, :6], np.zeros((len(intervals), 3))
+    shared = np.concatenate([TRUTH, np.zeros(intervals.n_shared - 3)])
+    residuals, ends = intervals.simulated(shared, x, d)
+    mixture = Mixture(np.full(9, noise), np.zeros(9), np.ones(9), np.full(9, 1e-12))
+    ones, std = np.ones(3), np.full(6, noise)
+    sizes = np.full(intervals.n_shared, np.inf)
+    return Fit(shared, x, d, residuals, ends, mixture, ones, 0.0 * ones, std, sizes, 0.0 * shared)
+
+
+@pytest.mark.parametrize(("noise", "n_steps"), [(1e-3, 2), (1e-13, 5)])
+def test_integration_steps_are_as_few_as_the_noise_hides(noise, n_steps):
+    intervals, signals = intervals_of()
+    fit = at_truth(intervals, signals, noise)
+    found = with_fewest_steps(intervals, fit, 5)
+    assert found.substeps == n_steps
+    change = (found.simulated(fit.shared, fit.x, fit.d)[0] - fit.residuals) / noise
+    assert np.sqrt(np.square(change).sum()) < 0.1
+
+
+def test_fewer_integration_steps_move_no_parameter_by_a_tenth_of_its_standard_error(monkeypatch):
+    signals, inputs = flight(MACHINES["planar-rotorcraft"], 500, 0.01, substeps=5)
+    noisy = signals + 1e-3 * signals.std(axis=0) * np.random.default_rng(3).normal(size=signals.shape)
+    log = as_log(MACHINES["planar-rotorcraft"], noisy, inputs, 0.01)
+    few = dr.identify(ROTORCRAFT, log)
+    monkeypatch.setattr(integration_steps, "_FEW", ())
+    five = dr.identify(ROTORCRAFT, log)
+    assert (few.estimate.resolution.substeps, five.estimate.resolution.substeps) == (2, 5)
+    for name, error in five.standard_errors.items():
+        assert few.parameters[name] == pytest.approx(five.parameters[name], abs=0.1 * error)
 
 
 def test_a_last_interval_that_is_not_full_has_rows_in_which_nothing_is_known():
@@ -484,12 +518,6 @@ def test_noise_that_unmodelled_accelerations_follow_does_not_attenuate_parameter
     assert (np.abs(long.parameters - TRUTH) < 4.0 * np.sqrt(np.diag(long.covariance))).all()
 
 
-def test_terms_are_sought_in_windows_of_four_intervals_at_most():
-    """Windows never span two logs, whose first intervals are 0 and 20."""
-    assert short_windows(np.array([0, 16, 20, 36]), 38).tolist() == [0, 4, 8, 12, 16, 20, 24, 28, 32, 36]
-    assert short_windows(np.array([0, 2, 4, 5]), 7).tolist() == [0, 2, 4, 5]
-
-
 @pytest.mark.parametrize(("correlation", "least"), [(0.0, 0.91), (0.5, 0.89), (0.8, 0.87), (0.9, 0.85), (0.95, 0.8)])
 def test_intervals_of_a_mean_hold_it_though_neighbours_are_correlated(correlation, least):
     """A first-order autoregression of 150 intervals; batches of sqrt(150) hold the mean in .66 of .95 at the last."""
@@ -609,25 +637,6 @@ def test_spikes_of_a_force_sensor_are_left_out_and_those_that_acted_are_kept():
         noted.append(any("spikes" in note for note in result.notes))
         assert result.parameters["mass"] == pytest.approx(2.0, rel=0.02)
     assert noted == [True, False]
-
-
-# ---------------------------------------------------------------------- delays
-
-
-@pytest.mark.parametrize(
-    ("dt", "range_of_settings", "samples"),
-    [
-        (0.01, (-0.03, 0.08), (-3, 8)),
-        (300.0, (-0.03, 0.08), (-2, 2)),
-        (1e-6, (-0.03, 0.08), (-100, 100)),
-        (300.0, (0.0, 0.08), (0, 2)),
-        (0.01, (0.0, 0.0), (0, 0)),
-    ],
-)
-def test_range_of_delays_is_of_some_samples_whatever_the_sampling_time(dt, range_of_settings, samples):
-    signals, inputs = flight(MACHINES["planar-rotorcraft"], 50, 0.01)
-    search = LocalSearch(dr.LoDiransac(delay_range=range_of_settings), None, np.zeros((1, 3)), None, None)
-    assert search.delays(intervals_over(signals, inputs, dt=dt)) == samples
 
 
 def test_durations_have_a_fitting_unit():

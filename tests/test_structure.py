@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.methods.lo_diransac.structural import CandidateTests, weighted
+from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, weighted
 from diransac.identification.structure.candidate_terms import candidate_terms
 from diransac.identification.structure.lacking_terms import PossibleTerm, mixture_intervals
 
@@ -165,12 +165,12 @@ def test_intervals_of_an_exact_model_hardly_widen_on_a_rich_log(complete):
 
 def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     """Estimate, error and effect of a term without a fit are those of a fit with the term as a parameter."""
-    from diransac.identification.methods.lo_diransac import method, structural
+    from diransac.identification.methods.lo_diransac import method
 
     kept = []
 
-    def recorded(*arguments):
-        kept.append(structural.candidates_tested(*arguments[:3], None))
+    def recorded(candidates, *_):
+        kept.append(candidates.tests)
         return ()
 
     monkeypatch.setattr(method, "possible_terms", recorded)
@@ -199,12 +199,10 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
 
 
 def test_terms_that_the_model_has_are_no_candidates(monkeypatch):
-    from diransac.identification.methods.lo_diransac import method, structural
+    from diransac.identification.methods.lo_diransac import method
 
     kept = []
-    monkeypatch.setattr(
-        method, "possible_terms", lambda *x: kept.append(structural.candidates_tested(*x[:3], None)) or ()
-    )
+    monkeypatch.setattr(method, "possible_terms", lambda candidates, *_: kept.append(candidates.tests) or ())
     identified(cart_log(4))
     kinds = {x.kind for x in kept[0].terms}
     # A gain of the only input is one of all parameters: no motion separates them.

@@ -30,6 +30,7 @@ _MODULES = {
     "predict": "results",
     "view": "results",
     "cross-validate": "identification",
+    "track": "tracking",
     "inspect": "inspection",
     "map": "inspection",
     "simulate": "simulate",

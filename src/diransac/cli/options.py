@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import isnan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,8 +31,12 @@ from diransac.identification.methods import ESTIMATORS, METHODS
 from diransac.limits import LARGEST_TEXT, MOST_COUNTED
 from diransac.simulation import HOLDS
 
+if TYPE_CHECKING:
+    from diransac.data.readers.growing import Growing
+
 __all__ = [
     "Derivation",
+    "FixedParameters",
     "JsonFlag",
     "LogFile",
     "LogFiles",
@@ -44,6 +48,7 @@ __all__ = [
     "Report",
     "ResultFile",
     "Search",
+    "Seed",
     "StrictFlag",
     "TimeLimit",
     "known_methods",
@@ -161,6 +166,11 @@ StrictFlag = Annotated[
     bool, typer.Option("--strict", help='End with exit code 3 where the verdict is "do not rely on this".')
 ]
 
+Seed = Annotated[int, typer.Option(help="The same seed gives the same answer.")]
+FixedParameters = Annotated[
+    list[str] | None,
+    typer.Option("--fix", metavar="NAME[=VALUE],...", help="Parameters that are known: mass=0.25, or by name."),
+]
 TimeLimit = Annotated[
     float | None,
     typer.Option("--time-limit", metavar="S", help="End the search after so many seconds, with what it has found."),
@@ -174,7 +184,7 @@ _option = partial(typer.Option, rich_help_panel="Preparation of the log, in this
 class Search:
     """Options of the identification: seed, settings, hold of the inputs, and parameters that are known."""
 
-    seed: Annotated[int, typer.Option(help="The same seed gives the same answer.")] = 0
+    seed: Seed = 0
     settings: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Settings by name.")] = None
     assignments: Annotated[
         list[str] | None,
@@ -200,10 +210,7 @@ class Search:
         ),
     ] = None
 
-    fixed: Annotated[
-        list[str] | None,
-        typer.Option("--fix", metavar="NAME[=VALUE],...", help="Parameters that are known: mass=0.25, or by name."),
-    ] = None
+    fixed: FixedParameters = None
     priors: Annotated[
         list[str] | None,
         typer.Option("--prior", metavar="NAME=MEAN,SD", help="A Gaussian prior of a parameter; repeatable."),
@@ -313,6 +320,24 @@ class Preparation:
     shift: Annotated[
         list[str] | None, _option("--shift", metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
     ] = None
+
+    def grow(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Growing:
+        """Reader of a file that grows, or of CSV text on stdin, like another log of the same recorder.
+
+        Raises LogError: it cannot be read; typer.BadParameter: an option changes samples that a complete log has.
+        """
+        from diransac.data.readers.growing import GrowingCsv, Pipe, growing
+        from diransac.data.readers.reading import Reading
+
+        kept = {"mapping", "columns", "rename", "scale"}
+        if any(x.name not in kept and getattr(self, x.name) for x in fields(self)):
+            raise typer.BadParameter(
+                "--follow takes --mapping, --columns, --map and --scale; other steps need a whole log"
+            )
+        reading = Reading.given(**{name: x for name, x in self._arguments(()).items() if name in kept and x})
+        if file == Path("-"):
+            return GrowingCsv(Pipe(typer.get_binary_stream("stdin")), "standard input", reading, like)
+        return growing(file, reading, like)
 
     def read_all(self, files: Sequence[Path], like: Sequence[Mapping[str, Any]] = ()) -> list[Log]:
         """The logs of several files, all prepared alike, and like a log of the same recorder, by its history."""

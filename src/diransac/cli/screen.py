@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol, TextIO
 
@@ -22,9 +22,11 @@ __all__ = [
     "bar",
     "command",
     "copy",
+    "emit",
     "end",
     "is_quiet",
     "is_terminal",
+    "live",
     "note",
     "progress_bar",
     "say",
@@ -71,6 +73,17 @@ def show(shown: Showable, as_json: bool) -> None:
     if _STATE["taken"]:
         raise typer.BadParameter("-o - and --json both write to stdout; give one")
     typer.echo(printable(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False)))
+
+
+def emit(data: Mapping[str, Any]) -> None:
+    """Print JSON on one line of stdout, at once; numbers that are not finite are null.
+
+    Parameters
+    ----------
+    data : mapping
+    """
+    typer.echo(printable(json.dumps(_finite(data), ensure_ascii=False, allow_nan=False)))
+    sys.stdout.flush()
 
 
 def say(*lines: str) -> None:
@@ -219,6 +232,28 @@ def bar(label: str) -> Iterator[Callback]:
             )
 
         yield update
+
+
+@contextmanager
+def live() -> Iterator[Callable[[str], None]]:
+    """Context with a callback that replaces a line on a terminal's stderr; without a terminal it shows nothing.
+
+    Yields
+    ------
+    callable
+        Takes the line.
+    """
+    if is_quiet() or not shows_bars():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(Text(""), console=Console(stderr=True), transient=True, auto_refresh=False) as shown:
+        yield lambda line: shown.update(
+            Text(printable(one_line(line)), no_wrap=True, overflow="ellipsis"), refresh=True
+        )
 
 
 def shows_bars() -> bool:

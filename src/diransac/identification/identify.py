@@ -27,6 +27,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.lacking_terms import with_terms
 from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
+from diransac.process import single_threaded
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
@@ -274,6 +275,7 @@ class _Task:
     compares: bool
     dataset_of: Callable[..., Dataset] = _moving_dataset
 
+    @single_threaded()  # matrices are small: more threads would only wait for one another
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """Identify from prepared logs."""
         logs = logs if self.method.needs_all_signals else [log.measured for log in logs]

@@ -230,9 +230,10 @@ def loop_specification(
     model: SimulatedModel,
     signals: Sequence[str],
     integrator: str,
-    substeps: int,
     hold: str,
     sensitivities: Sensitivities | None = None,
+    *,
+    divided: bool,
 ) -> LoopSpecification:
     """Expressions of one row, as graphs.
 
@@ -244,12 +245,12 @@ def loop_specification(
         Signals that are compared with measurements.
     integrator : str
         One of `INTEGRATORS`.
-    substeps : int
-        Integration steps from one row to the next.
     hold : str
         One of `HOLDS`.
     sensitivities : Sensitivities, optional
         The derivatives to simulate.
+    divided : bool
+        Whether there may be several integration steps from one row to the next.
     """
     from diransac.simulation.compiler.time_loop import PARAMETER, STEP, LoopSpecification
 
@@ -274,7 +275,7 @@ def loop_specification(
     return LoopSpecification(
         step=read_graph(step, (PARAMETER, STEP), reciprocals=True),
         dynamics=dynamics,
-        substeps=substeps,
+        divided=divided,
         n_states=len(model.state),
         n_inputs=model.n_u + n_changes,
         n_changes=n_changes,

@@ -323,7 +323,13 @@ class Rollouts(Simulator):
         """Run the time loop over all blocks of lanes; `values` are its other arguments by name."""
         if lanes.n_lanes:
             code = self._compiled(output, inputs, unknowns, lanes.has_windows)
-            run_time_loop(code, lanes, {"step": batch.dt / self._substeps, **values}, threads)
+            steps = {"step": batch.dt / self._substeps, "substeps": self._substeps}
+            run_time_loop(code, lanes, {**steps, **values}, threads)
+
+    @property
+    def _is_divided(self) -> bool:
+        """True for code of rows with several sub-steps, which serves any number of them."""
+        return self._substeps > 1
 
     def _derivatives(self, unknowns: tuple[str, ...]) -> Sensitivities:
         """Structure of the derivatives with respect to some unknowns, found when first needed."""
@@ -340,9 +346,9 @@ class Rollouts(Simulator):
                     self._model,
                     self.signals,
                     self._integrator,
-                    self._substeps,
                     self._hold,
                     self._derivatives(unknowns) if unknowns else None,
+                    divided=self._is_divided,
                 )
             return self._specifications[unknowns]
 
@@ -381,7 +387,7 @@ class Rollouts(Simulator):
         """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""
         model = self._model
         sizes = (model.n_q, model.n_u, model.n_p, tuple(model.parameters), model.state, model.signals)
-        options = (self.signals, unknowns, self._integrator, self._substeps, self._hold)
+        options = (self.signals, unknowns, self._integrator, self._is_divided, self._hold)
         jacobians = [model.rate_jacobians.serialize()] if unknowns else []
         return [repr((sizes, model.quaternions, options)), self._dynamics, *jacobians]
 

@@ -12,7 +12,17 @@ from diransac.data.preprocessing.continuity import (
 )
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
-from diransac.data.preprocessing.steps import in_units, keep_while, leave_out, prepared, rename, resample, scale, shift
+from diransac.data.preprocessing.steps import (
+    in_units,
+    keep_while,
+    leave_out,
+    prepared,
+    rename,
+    resample,
+    scale,
+    shift,
+    unit_factors,
+)
 
 __all__ = [
     "acting_inputs",
@@ -31,6 +41,7 @@ __all__ = [
     "running_deviation",
     "scale",
     "shift",
+    "unit_factors",
     "unit_quaternions",
     "unwrap",
     "whole_quaternions",

@@ -38,6 +38,7 @@ __all__ = [
     "resampling_grid",
     "scale",
     "shift",
+    "unit_factors",
 ]
 
 Column = TypeVar("Column")
@@ -125,6 +126,25 @@ def scale(log: Log, factors: Mapping[str, float]) -> Log:
     return log.with_step(step, signals=signals, units=units)
 
 
+def unit_factors(units: Mapping[str, str], model: Model, source: str) -> dict[str, float]:
+    """Factors that bring signals and inputs of other units into those of a model.
+
+    Raises LogError: a unit has another dimension than the model's.
+    """
+    factors: dict[str, float] = {}
+    for name in (n for n in (*model.signals, *model.inputs) if n in units):
+        found, wanted = units[name], model.units[name]
+        if same_unit(found, wanted):
+            continue
+        factor = conversion(found, wanted)
+        if factor is None:
+            raise LogError(
+                f'{source}: signal "{name}" is in {found}, the model needs {wanted}; check the column and its unit'
+            )
+        factors[name] = factor
+    return factors
+
+
 def in_units(log: Log, model: Model) -> Log:
     """Log with the signals and inputs of a model in the model's units; the same log if they are.
 
@@ -139,17 +159,7 @@ def in_units(log: Log, model: Model) -> Log:
     LogError
         A unit has another dimension than the model's.
     """
-    factors: dict[str, float] = {}
-    for name in (n for n in (*model.signals, *model.inputs) if n in log and n in log.units):
-        found, wanted = log.units[name], model.units[name]
-        if same_unit(found, wanted):
-            continue
-        factor = conversion(found, wanted)
-        if factor is None:
-            raise LogError(
-                f'{log.source}: signal "{name}" is in {found}, the model needs {wanted}; check the column and its unit'
-            )
-        factors[name] = factor
+    factors = unit_factors({name: unit for name, unit in log.units.items() if name in log}, model, log.source)
     if not factors:
         return log
     return log.with_step(

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-__all__ = ["BagRecording", "McapFile", "RosBag", "open_bag", "open_mcap"]
+__all__ = ["BagRecording", "McapFile", "RosBag", "damages", "open_bag", "open_mcap", "unpacked"]
 
 INSTALL = 'install them with pip install "diransac[logs]"'
-_LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
+LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
 _OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
 _NUMBERS = (bool, int, float, np.number, np.bool_)
@@ -269,7 +269,7 @@ class McapFile:
         self._schemas: dict[int, Any] = {}
         self._channels: dict[int, Any] = {}
         self._chunks: dict[int, Collection[int]] = {}
-        with path.open("rb") as file, contextlib.suppress(*_damages()):
+        with path.open("rb") as file, contextlib.suppress(*damages()):
             summary = make_reader(file).get_summary()
             if summary is not None and summary.statistics is not None:
                 self._schemas, self._channels = dict(summary.schemas), dict(summary.channels)
@@ -302,7 +302,7 @@ class McapFile:
         from mcap.stream_reader import StreamReader, breakup_chunk
 
         with self._path.open("rb") as file:
-            reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_CHUNK)
+            reader = StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_CHUNK)
             try:
                 for record in reader.records:
                     if isinstance(record, (records.DataEnd, records.Footer)):
@@ -310,8 +310,8 @@ class McapFile:
                     if not isinstance(record, records.Chunk):
                         yield record
                     elif wanted is None or self._may_hold(file.tell(), wanted):
-                        yield from breakup_chunk(_unpacked(record))
-            except _damages() as error:
+                        yield from breakup_chunk(unpacked(record))
+            except damages() as error:
                 if file.tell() <= _MAGIC_SIZE:
                     raise LogError(f"{self._source}: it is not an MCAP file") from error
                 what = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -341,7 +341,7 @@ class McapFile:
         return self._decoders[key]
 
 
-def _damages() -> tuple[type[Exception], ...]:
+def damages() -> tuple[type[Exception], ...]:
     """Errors that a damaged MCAP file leads to."""
     import zstandard
     from mcap.exceptions import McapError
@@ -349,10 +349,10 @@ def _damages() -> tuple[type[Exception], ...]:
     return (McapError, zstandard.ZstdError, *DAMAGE)
 
 
-def _unpacked(chunk: Any) -> Any:
+def unpacked(chunk: Any) -> Any:
     """The chunk with its records unpacked.  Raises ValueError: they are not as long as it says, or too long."""
     size = chunk.uncompressed_size
-    if size > _LARGEST_CHUNK:
+    if size > LARGEST_CHUNK:
         raise ValueError(f"a chunk of {size} bytes is longer than is read")
     data = chunk.data
     if chunk.compression == "zstd":

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-__all__ = ["joined", "read_csv", "read_csv_gz"]
+__all__ = ["fields_of", "head_of", "joined", "read_csv", "read_csv_gz"]
 
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
@@ -111,7 +111,12 @@ class _Times:
     reason: str
 
 
-def _fields(line: str) -> list[str]:
+def head_of(lines: Sequence[str]) -> int | None:
+    """Number of lines above the first row of numbers, of text with a header; None where that row is missing."""
+    return next((k for k, line in enumerate(lines) if k and any(map(_is_number, fields_of(line)))), None)
+
+
+def fields_of(line: str) -> list[str]:
     """Fields of a line, between separators or else between spaces."""
     separated = any(x in line for x in _SEPARATORS)
     return [x.strip() for x in (line.split(_separator(line)) if separated else line.split())]
@@ -119,7 +124,7 @@ def _fields(line: str) -> list[str]:
 
 def _is_row(line: str) -> bool:
     """True for a line of numbers."""
-    return all(_is_number(x) for x in _fields(line))
+    return all(_is_number(x) for x in fields_of(line))
 
 
 def _with_bare_header(lines: list[str]) -> list[str]:
@@ -128,7 +133,7 @@ def _with_bare_header(lines: list[str]) -> list[str]:
     if not 0 < n < len(lines) or not _is_row(lines[n]):
         return lines
     header = lines[n - 1].lstrip("#%/ ")
-    if len(_fields(header)) != len(_fields(lines[n])) or _is_row(header):
+    if len(fields_of(header)) != len(fields_of(lines[n])) or _is_row(header):
         return lines
     return [*lines[: n - 1], header, *lines[n:]]
 
@@ -206,7 +211,7 @@ def _names_of(name: str, data: bytes, source: str) -> list[str] | None:
     """Names of the columns of a file without a header; None for a file that has one."""
     lines = _with_bare_header(_text(data, source)[0].split("\n"))
     first = next((x for x in lines if x.strip() and not x.startswith(_COMMENTS)), "")
-    fields = _fields(first)
+    fields = fields_of(first)
     if not _is_row(first):
         return None
     if len(fields) == 1:

@@ -103,6 +103,49 @@ class Reading:
         if isinstance(opened, Table):
             done = {step["step"] for step in opened.history}
             earlier = Reading.of(step for step in like if step["step"] not in done)
+        table, resample = self._table(opened, earlier, columns, repairs, source)
+        mapping, unmeasured = self._chosen("mapping", earlier), self._chosen("unmeasured", earlier)
+        if unmeasured:
+            table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
+        log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
+        log = preprocessing.prepared(log, {} if mapping is None else mapping.preparation)
+        spiky = [name for name in earlier.despike if name in log]
+        delays = {name: x for name, x in earlier.shift.items() if name in log}
+        return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
+
+    def part(
+        self, opened: Table, source: str, like: Sequence[Mapping[str, Any]]
+    ) -> tuple[dict[str, FloatArray], dict[str, str]]:
+        """Columns of a part of a table that grows, with its time ``t`` in seconds, and their units.
+
+        Nothing is repaired or resampled, and no step of a preparation is done.
+
+        Raises LogError, SettingsError: as `read_log`; the time is that of a calendar.
+        """
+        earlier = Reading.of(like)
+        table, _ = self._table(opened, earlier, self._chosen("columns", earlier), Repairs(), source)
+        if opened.times and not table.times:
+            raise LogError(f"{source}: its time is that of a calendar, which cannot be followed; give seconds")
+        factors = {**earlier._factors(table), **self.scale}
+        time, _ = seconds(table, factors, source)
+        signals, _ = _signals(table, len(time), source)
+        units = {n: unit for n, unit in table.units.items() if n in signals and abs(factors.get(n, 1.0)) == 1.0}
+        return {"t": time, **{n: x * factors.get(n, 1.0) for n, x in signals.items()}}, units
+
+    def topics(self, like: Sequence[Mapping[str, Any]]) -> tuple[LogMapping | None, dict[str, str]]:
+        """Mapping, and new names by ``topic.field``, of a recording."""
+        earlier = Reading.of(like)
+        return self._chosen("mapping", earlier), {**earlier.rename, **self.rename}
+
+    def _table(
+        self,
+        opened: Table | Recording,
+        earlier: Reading,
+        columns: Sequence[str] | None,
+        repairs: Repairs,
+        source: str,
+    ) -> tuple[Table, float | str | None]:
+        """Table of the signals, with the time ``t``, and the resampling that is left to do."""
         mapping, resample = self._chosen("mapping", earlier), self._chosen("resample", earlier)
         if isinstance(opened, Table):
             opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
@@ -128,14 +171,7 @@ class Reading:
             from diransac.data.readers.topics import mapped_table
 
             table = mapped_table(table, mapping, source)
-        unmeasured = self._chosen("unmeasured", earlier)
-        if unmeasured:
-            table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
-        log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
-        log = preprocessing.prepared(log, {} if mapping is None else mapping.preparation)
-        spiky = [name for name in earlier.despike if name in log]
-        delays = {name: x for name, x in earlier.shift.items() if name in log}
-        return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
+        return table, resample
 
     def _chosen(self, name: str, earlier: Reading) -> Any:
         """An argument, else that of an earlier reading, else what the mapping says."""

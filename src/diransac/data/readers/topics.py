@@ -21,7 +21,18 @@ if TYPE_CHECKING:
 
     from diransac.data.readers.repair import Repairs
 
-__all__ = ["TopicFacts", "TopicTable", "is_one_table", "list_topics", "mapped_table", "table_of_topics", "whole_topic"]
+__all__ = [
+    "TopicFacts",
+    "TopicTable",
+    "entries_of",
+    "is_one_table",
+    "list_topics",
+    "mapped_table",
+    "signals_of",
+    "table_of_topics",
+    "wanted_by",
+    "whole_topic",
+]
 
 
 # ---------------------------------------------------------------------- tables
@@ -83,28 +94,10 @@ def table_of_topics(
 
     Raises LogError: neither is given; a topic or field is missing; ``rename`` has a part of a vector; as `align`.
     """
-    source, fields = recording.source, recording.fields
-    entries, notes = ([], []) if mapping is None else mapping.chosen(_with_texts(recording), recording.elements, source)
-    entries = [x for x in entries if not set(x.names) <= set(rename)]
-    for name, path in rename.items():
-        if name == "t":
-            raise LogError(f'{source}: each topic has its own time; leave out "t", and give the signals')
-        together = next((x.names for x in entries if name in x.names), None)
-        if together is not None:
-            whole = ", ".join(together)
-            raise LogError(f'{source}: the mapping has "{name}" with {whole}; rename all of these, or none')
-        topic, label = find_field(path, fields, source)
-        entries.append(MappedSignals((name,), (label,), topic))
-    if not entries:
-        raise LogError(
-            f"{source}: it has {len(fields)} topics, {some(fields, 12)}; say what they are: "
-            "--mapping NAME|FILE.toml, or --map thrust=topic.field"
-        )
-    wanted: dict[str, tuple[str, ...]] = {}
-    for entry in entries:
-        wanted[entry.topic] = tuple(dict.fromkeys((*wanted.get(entry.topic, ()), *entry.needs)))
-    read = recording.read(wanted, "header" if mapping is None else mapping.time)
-    parts = {topic: _signals_of(topic, samples, entries, repairs, source) for topic, samples in read.items()}
+    source = recording.source
+    entries, notes = entries_of(recording, mapping, rename)
+    read = recording.read(wanted_by(entries), "header" if mapping is None else mapping.time)
+    parts = {topic: signals_of(topic, samples, entries, repairs, source) for topic, samples in read.items()}
     if "clock" in repairs and resample is None and len(parts) > 1 and not _is_even(parts):
         resample = "median"
         repairs.record("clock", "the topics' clocks are uneven; resampled at the median rate of the fastest")
@@ -127,6 +120,41 @@ def table_of_topics(
     ) > 1 else resample
 
 
+def entries_of(
+    recording: Recording, mapping: LogMapping | None, rename: Mapping[str, str]
+) -> tuple[list[MappedSignals], list[str]]:
+    """Signals that a mapping, and ``rename`` by ``topic.field``, take from a recording, and notes on what it lacks.
+
+    Raises LogError: neither is given; a topic or field is missing; ``rename`` has a part of a vector.
+    """
+    source, fields = recording.source, recording.fields
+    entries, notes = ([], []) if mapping is None else mapping.chosen(_with_texts(recording), recording.elements, source)
+    entries = [x for x in entries if not set(x.names) <= set(rename)]
+    for name, path in rename.items():
+        if name == "t":
+            raise LogError(f'{source}: each topic has its own time; leave out "t", and give the signals')
+        together = next((x.names for x in entries if name in x.names), None)
+        if together is not None:
+            whole = ", ".join(together)
+            raise LogError(f'{source}: the mapping has "{name}" with {whole}; rename all of these, or none')
+        topic, label = find_field(path, fields, source)
+        entries.append(MappedSignals((name,), (label,), topic))
+    if not entries:
+        raise LogError(
+            f"{source}: it has {len(fields)} topics, {some(fields, 12)}; say what they are: "
+            "--mapping NAME|FILE.toml, or --map thrust=topic.field"
+        )
+    return entries, notes
+
+
+def wanted_by(entries: Sequence[MappedSignals]) -> dict[str, tuple[str, ...]]:
+    """Fields of each topic that some signals need."""
+    wanted: dict[str, tuple[str, ...]] = {}
+    for entry in entries:
+        wanted[entry.topic] = tuple(dict.fromkeys((*wanted.get(entry.topic, ()), *entry.needs)))
+    return wanted
+
+
 def _flags(recording: Recording, mapping: LogMapping, rows: FloatArray) -> dict[str, FloatArray]:
     """Flags (N,) of the events of a mapping at the rows of a log, without those whose topic has no message."""
     found = {}
@@ -142,7 +170,7 @@ def _with_texts(recording: Recording) -> dict[str, tuple[str, ...]]:
     return {topic: (*fields, *recording.texts.get(topic, ())) for topic, fields in recording.fields.items()}
 
 
-def _signals_of(
+def signals_of(
     topic: str, samples: Samples, entries: Sequence[MappedSignals], repairs: Repairs, source: str
 ) -> Samples:
     """The mapped signals of one topic."""

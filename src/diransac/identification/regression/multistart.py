@@ -2,7 +2,7 @@
 
 References
 ----------
-Levenberg 1944; Marquardt 1963; Boender, Rinnooy Kan 1987 (random starts).
+Levenberg 1944; Marquardt 1963; Transtrum and Sethna 2012 (damping); Boender, Rinnooy Kan 1987 (random starts).
 """
 
 from __future__ import annotations
@@ -11,10 +11,16 @@ from typing import Protocol
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
+from diransac.identification.regression.estimators import solve_definite
 from diransac.time_limit import check_time
 
 __all__ = ["LeastSquaresProblem", "least_squares"]
+
+# Marquardt's damping at the start, and its bounds: the last is a step of nothing.
+_DAMPING, _BOUNDS = 1e-2, (1e-9, 1e9)
+# Factors of the damping after a better trial, and after another one.
+_BETTER, _WORSE = 0.2, 6.0
 
 
 class LeastSquaresProblem(Protocol):
@@ -23,11 +29,13 @@ class LeastSquaresProblem(Protocol):
     def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
         """Unknowns (n_lanes, n) after a step, within their bounds."""
 
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (n_lanes,), infinite after a divergence, its gradient / 2 (n_lanes, n), and the normal matrix."""
+    def linearized(self, z: FloatArray, lanes: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (k,) of some lanes, infinite after a divergence, its gradient / 2 (k, n), and the normal matrix."""
 
 
-def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> tuple[FloatArray, FloatArray]:
+def least_squares(
+    problem: LeastSquaresProblem, z: FloatArray, n_steps: int, tolerance: float = 1e-9
+) -> tuple[FloatArray, FloatArray]:
     """Unknowns and their costs after steps of Levenberg and Marquardt from every start.
 
     Parameters
@@ -37,6 +45,8 @@ def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> 
         Unknowns to start from.
     n_steps : int
         Largest number of steps.
+    tolerance : float, optional
+        Relative decrease of its cost at which a lane has converged.
 
     Returns
     -------
@@ -49,22 +59,23 @@ def least_squares(problem: LeastSquaresProblem, z: FloatArray, n_steps: int) -> 
     TimeLimitError
         The time limit was reached.
     """
-    (cost, gradient, matrix), damping = problem.linearized(z), np.full(len(z), 1e-2)
+    z, damping = z.copy(), np.full(len(z), _DAMPING)
+    cost, gradient, matrix = problem.linearized(z, np.arange(len(z)))
+    active = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_steps):
-        check_time()
-        scale = np.sqrt(np.einsum("kii->ki", matrix)) + 1e-300
-        scaled = matrix / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(z.shape[1])
-        step = -np.linalg.solve(scaled, (gradient / scale)[:, :, None])[:, :, 0] / scale
-        trial = problem.moved(z, step)
-        then = problem.linearized(trial)
-        better = then[0] < cost
-        settled = better & (then[0] > (1.0 - 1e-9) * cost) | (damping >= 1e9)
-        z = np.where(better[:, None], trial, z)
-        cost, gradient, matrix = (
-            np.where(better.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
-            for x, y in zip((cost, gradient, matrix), then, strict=True)
-        )
-        damping = np.clip(np.where(better, 0.2, 6.0) * damping, 1e-9, 1e9)
-        if settled.all():
+        if not len(active):
             break
+        check_time()
+        H, g = matrix[active], gradient[active]
+        scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
+        scaled = H / scale[:, :, None] / scale[:, None, :] + damping[active, None, None] * np.eye(z.shape[1])
+        step = -np.nan_to_num(solve_definite(scaled, g / scale)) / scale
+        trial = problem.moved(z[active], step)
+        then = problem.linearized(trial, active)
+        better = then[0] < cost[active]
+        settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])
+        to = active[better]
+        z[to], cost[to], gradient[to], matrix[to] = (x[better] for x in (trial, *then))
+        damping[active] = np.clip(np.where(better, _BETTER, _WORSE) * damping[active], *_BOUNDS)
+        active = active[~settled]
     return z, cost

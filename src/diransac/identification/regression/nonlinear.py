@@ -28,9 +28,9 @@ from diransac.identification.regression.estimators import (
     smallest_eigenvalue,
     solve_definite,
 )
+from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.rows import NullSpace, Solution, null_space, regression
 from diransac.identification.regression.uncertainty import rows_without, score_inflation
-from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,8 +45,8 @@ __all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
 _ROWS_FOR_STARTS = 100
-# Marquardt's damping at the start, and its bounds.
-_DAMPING = (1e-3, 1e-12, 1e12)
+# Relative decrease of a sum of squares at which a fit has converged: to rounding.
+_CONVERGED = 1e-14
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
 _LOG_BOUND = 27.6
 
@@ -141,7 +141,7 @@ class BoundNonlinear:
         whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // 2000)]))
         self._starts = np.vstack([whole, self._starts])
         self.of_all_rows = self._chart.to_parameters(whole)[0]
-        errors, J = self._errors(everything, whole)
+        errors, J = self.errors(everything, whole)
         errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
@@ -165,14 +165,14 @@ class BoundNonlinear:
 
     def median_errors(self) -> FloatArray:
         """Median error ``(r,)`` of the fit of all rows, over the size of each signal."""
-        errors, _ = self._errors(np.arange(self.n_rows)[None], self._chart.to_free(self.of_all_rows[None]))
+        errors, _ = self.errors(np.arange(self.n_rows)[None], self._chart.to_free(self.of_all_rows[None]))
         return np.median(np.abs(errors.reshape(self.n_rows, -1)), axis=0) + np.finfo(float).tiny
 
     def is_informed_elsewhere(self) -> bool:
         """True if the Jacobian of the rows has full rank at other parameters than those of the fit."""
         rows = np.arange(self.n_rows)[:: max(1, self.n_rows // _ROWS_FOR_STARTS)]
         some = self._starts[1 :: max(1, len(self._starts) // 20)]
-        J = self._errors(np.tile(rows, (len(some), 1)), some)[1].reshape(len(some), -1, self._n_p)
+        J = self.errors(np.tile(rows, (len(some), 1)), some)[1].reshape(len(some), -1, self._n_p)
         J = J[np.isfinite(J).all(axis=(1, 2))]
         J = J / np.maximum(np.sqrt(np.square(J).mean(axis=1, keepdims=True)), np.finfo(float).tiny)
         gram = np.einsum("bri,brj->bij", J, J)
@@ -220,7 +220,7 @@ class BoundNonlinear:
             Fit of all rows.
         """
         free, r = self._chart.to_free(p[None]), len(self._scale)
-        errors, J = (x[0].reshape(len(rows), r, *x.shape[2:]) for x in self._errors(rows[None], free))
+        errors, J = (x[0].reshape(len(rows), r, *x.shape[2:]) for x in self.errors(rows[None], free))
         H, slope = np.einsum("nri,nrj->ij", J, J), np.einsum("nri,nr->i", J, errors)
         if len(self._layout.with_prior):
             prior = self._prior_errors(np.array([np.square(errors).mean()]), None)
@@ -237,7 +237,8 @@ class BoundNonlinear:
         starts, (n_sets, n) = self._starts, rows.shape
         few = rows[:, :: max(1, n // _ROWS_FOR_STARTS)]
         every = np.tile(np.arange(len(starts)), n_sets)
-        costs = self._costs(np.repeat(few, len(starts), axis=0), starts[every]).reshape(n_sets, -1)
+        errors, _ = self.errors(np.repeat(few, len(starts), axis=0), starts[every])
+        costs = np.square(errors).sum(axis=1).reshape(n_sets, -1)
         best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
         followed = starts[best]
         if self._linear is not None:
@@ -273,36 +274,14 @@ class BoundNonlinear:
     def _descend(
         self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Levenberg-Marquardt on every lane until convergence: free coordinates and sums of squares."""
-        free, damping, active = free.copy(), np.full(len(free), _DAMPING[0]), np.arange(len(free))
-        errors, J = self._errors(rows, free, prior)
-        costs = np.square(errors).sum(axis=1)
-        for _ in range(self._settings.max_steps):
-            check_time()
-            H = np.einsum("bni,bnj->bij", J[active], J[active])
-            slope = np.einsum("bni,bn->bi", J[active], errors[active])
-            diagonal = np.einsum("bii->bi", H)
-            H = H + (damping[active, None] * (diagonal + 1e-12))[:, :, None] * np.eye(self._n_p)
-            trial = self._chart.clip(free[active] - np.nan_to_num(solve_definite(H, slope)))
-            trial_errors, trial_J = self._errors(rows[active], trial, None if prior is None else prior.of(active))
-            trial_costs = np.square(trial_errors).sum(axis=1)
-            with np.errstate(invalid="ignore"):
-                gain = costs[active] - trial_costs
-            better = gain > 0.0
-            going = np.where(better, gain > 1e-14 * costs[active], damping[active] < _DAMPING[2])
-            damping[active] = np.clip(damping[active] * np.where(better, 0.1, 4.0), *_DAMPING[1:])
-            to = active[better]
-            free[to], errors[to], J[to], costs[to] = (x[better] for x in (trial, trial_errors, trial_J, trial_costs))
-            active = active[going]
-            if not len(active):
-                break
-        return free, costs
+        """Free coordinates ``(B, n_p)`` after steps from each start, and their sums of squares."""
+        return least_squares(_Lanes(self, rows, prior), free, self._settings.max_steps, _CONVERGED)
 
-    def _costs(self, rows: IntArray, free: FloatArray) -> FloatArray:
-        """Sum of squares ``(B,)``, infinite where it is not finite."""
-        return np.asarray(np.square(self._errors(rows, free)[0]).sum(axis=1))
+    def clipped(self, free: FloatArray) -> FloatArray:
+        """Free coordinates within their bounds."""
+        return self._chart.clip(free)
 
-    def _errors(
+    def errors(
         self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in free coordinates; those of priors last."""
@@ -341,6 +320,24 @@ class BoundNonlinear:
         index = np.broadcast_to(self._layout.index[self._log_of_row[rows]][:, None, :], J.shape)
         np.put_along_axis(full, index, J, axis=2)
         return full
+
+
+@dataclass(frozen=True)
+class _Lanes:
+    """Fits of row sets ``(B, n)`` with errors of priors: the problem of `least_squares` in free coordinates."""
+
+    bound: BoundNonlinear
+    rows: IntArray
+    prior: _PriorErrors | None
+
+    def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
+        return self.bound.clipped(now + step)
+
+    def linearized(self, z: FloatArray, lanes: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        errors, J = self.bound.errors(self.rows[lanes], z, self.prior and self.prior.of(lanes))
+        cost = np.square(errors).sum(axis=1)
+        of_finite = np.where(np.isfinite(cost)[:, None], errors, 0.0)
+        return cost, np.einsum("bni,bn->bi", J, of_finite), np.einsum("bni,bnj->bij", J, J)
 
 
 @dataclass(frozen=True)

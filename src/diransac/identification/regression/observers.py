@@ -240,7 +240,7 @@ class _Search(ABC):
             then[:, j] = np.clip(then[:, j], bound.lower, bound.upper)
         return then
 
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def linearized(self, z: FloatArray, lanes: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Cost (n_starts,), infinite after a divergence, its gradient / 2 (n_starts, n), and the normal matrix."""
         cost, gradient, matrix = np.zeros(len(z)), np.zeros(z.shape), np.zeros((*z.shape, z.shape[1]))
         free = self.model.parameters if self.parameters is None else ()

@@ -2,5 +2,5 @@
 
 In: a model, a dataset or its rows of motions.  Out: ambiguous parameters in words (`structural` of equations,
 `identifiability` of logs), parameters that are known beforehand, causes of refusals, mistakes of columns, and terms
-that the model lacks, from candidates over their selection to sentences.  Begin with `identifiability`.
+that a model may lack: candidates, and sentences about those that are found.  Begin with `identifiability`.
 """

@@ -21,10 +21,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.errors import ModelError
-from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS
-from diransac.model import Model
+from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS, Suggestion
+from diransac.model import Model, expressions
 from diransac.model.derivation import Symbols, call_user
 
 __all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
@@ -84,11 +84,6 @@ class CandidateTerm:
         """True if the term changes an input."""
         return self.equation < 0
 
-    @property
-    def is_input_gain(self) -> bool:
-        """True if the term scales an input."""
-        return self.kind == INPUT_GAIN
-
 
 @dataclass(frozen=True)
 class CandidateTerms:
@@ -106,21 +101,6 @@ class CandidateTerms:
 
     def __len__(self) -> int:
         return len(self.terms)
-
-    @property
-    def is_input_gain(self) -> BoolArray:
-        """Mask of the terms that scale an input."""
-        return np.array([x.is_input_gain for x in self.terms])
-
-    @property
-    def bounds(self) -> FloatArray:
-        """Smallest and largest coefficient (n_terms, 2) of each term."""
-        return np.array([x.bounds for x in self.terms])
-
-    @property
-    def groups(self) -> IntArray:
-        """Number of the parameter of each term: Stribeck friction at several speeds has the same."""
-        return np.unique([x.parameter for x in self.terms], return_inverse=True)[1].astype(np.int64)
 
     @cached_property
     def _entries(self) -> tuple[ca.Function, IntArray, IntArray]:
@@ -155,6 +135,37 @@ class CandidateTerms:
             values = _in_every_row(entries, [x[part] for x in motion]) * weights[part, None]
             found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
         return found
+
+    def suggestion(self, k: int, value: float, error: float, explained: float) -> Suggestion:
+        """Term k in words and as a line of model code.
+
+        Parameters
+        ----------
+        k : int
+        value, error : float
+            Coefficient and its standard error.
+        explained : float
+            Fraction of the mean square of the unmodelled force that the term explains.
+
+        Returns
+        -------
+        Suggestion
+        """
+        term = self.terms[k]
+        digits = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0.0 else 3
+        size, spread = (f"{x:.{digits}f}" if digits < 6 else f"{x:.3g}" for x in (value, error))
+        unit = f" {term.unit}" if term.unit not in ("", "1") else ""
+        share = f"explains {100.0 * explained:.0f} % of the unmodelled force"
+        if term.kind == INPUT_GAIN:
+            text = f"Gain of {term.place}: an error of {size} ± {spread} {share}"
+        else:
+            formula = f" {term.formula}" if term.formula else ""
+            text = f"{term.name[0].upper()}{term.name[1:]}: {size} ± {spread}{unit}{formula} {share}"
+        h = ca.Function("term", list(self.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
+        return Suggestion(
+            term.kind, term.place, text, term.parameter, value, error, term.unit, explained,
+            term.code, expressions.stored(f"term {term.parameter}", h), term.name,
+        )  # fmt: skip
 
 
 def _in_every_row(function: ca.Function, arrays: Sequence[FloatArray]) -> FloatArray:

@@ -259,7 +259,7 @@ class Suggestion:
     unit : str
         Unit of the coefficient; empty if unknown.
     explained : float
-        Fraction of the mean square unmodelled force of the equation that the term explains.
+        Fraction of the mean square unmodelled force of the equation, after earlier suggestions, that the term explains.
     code : str
         Python code, with CasADi as ``ca``: a summand of the residual with its sign, or what replaces the input.
     term : mapping of str to object

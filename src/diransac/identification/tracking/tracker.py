@@ -226,6 +226,9 @@ class Tracker:
             self._changes.after_step(window, window.optimise())
         except np.linalg.LinAlgError:
             self._begin_anew()
+        else:
+            if self._setup.layout.violations(window.fit.shared):
+                self._begin_anew()
         return self._window is not None
 
     def _joining(self, end: int) -> int | None:

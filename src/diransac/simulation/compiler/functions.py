@@ -235,7 +235,7 @@ class Scan(_Compiled):
 
         return LoopSpecification(
             step=read_graph(self._function, (2,), reciprocals=True),
-            substeps=1,
+            divided=False,
             n_states=self._widths_in[0],
             n_inputs=self._widths_in[1],
             n_signals=self._widths_out[1],

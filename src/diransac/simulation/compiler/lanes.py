@@ -56,6 +56,7 @@ ARGUMENTS = {
     "series": "pointer",  # (n_lanes, n_rows, width) float64
     "final": "pointer",  # (n_lanes, n_states or more) float64
     "step": "number",  # seconds, of one sub-step
+    "substeps": "integer",  # of a row, read where rows are divided
     "min_inlier_signals": "integer",
     "products": "integer",  # 0 leaves out J' W J
     "n_lanes": "integer",

@@ -63,7 +63,7 @@ class LoopSpecification:
     step : graph of (x, u, p, h) -> (x after one sub-step, signals before it); where derivatives are simulated, or the
         dynamics are called, it also returns the states and inputs of each stage, and the components of the quaternions
         before they are scaled.  Where the dynamics are called, it has a further argument, their results in each stage
-    substeps : sub-steps per row
+    divided : True if a row may take several sub-steps, whose number is an argument of the loop
     n_states, n_inputs, n_signals : sizes of x, u, and all signals
     n_changes : number of trailing elements of u that the leading ones change by with each sub-step: those are the
         differences of the inputs of one order after the other, as in Newton's interpolation
@@ -76,7 +76,7 @@ class LoopSpecification:
     """
 
     step: Graph
-    substeps: int
+    divided: bool
     n_states: int
     n_inputs: int
     n_signals: int
@@ -228,12 +228,12 @@ class TimeLoop:
 
     def _row(self, output: Output, block: Block, rows: Loop, u: list[Value]) -> None:
         """Emit one row: its sub-steps share their code, and the first one has the output."""
-        if self.specification.substeps == 1:
+        if not self.specification.divided:
             signals, after = self._substep(block, u)
             self._output(output, block, rows, u, signals)
             self._set_state(after)
             return
-        with self.v.repeat(integer(0), integer(self.specification.substeps)) as steps:
+        with self.v.repeat(integer(0), self.arguments["substeps"]) as steps:
             signals, after = self._substep(block, self._changed(u, steps.index))
             with self.builder.if_then(self.builder.icmp_signed("==", steps.index, integer(0))):
                 self._output(output, block, rows, u, signals)

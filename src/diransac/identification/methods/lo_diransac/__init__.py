@@ -15,7 +15,7 @@
 | `recording_errors.py` | delays and biases of sensors, delays of inputs, gains that drift |
 | `projection.py` | parameters and covariance |
 | `checks.py` | findings of a fit on itself |
-| `missing_terms.py` | terms that explain the unmodelled forces |
+| `missing_terms.py`, `term_evidence.py` | terms that the model may lack: tests at the fit, suggestions, weights |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

@@ -128,7 +128,10 @@ def compete(
         return first
     if first is not None and not first.likeliest.complete:
         return first
-    contest = Contest(settings, dataset, whole[0], whole[1] if first is None else first.motion, seed, callback)
+    intervals, motion = whole[:2]
+    if first is not None:
+        intervals, motion = replace(intervals, substeps=first.likeliest.intervals.substeps), first.motion
+    contest = Contest(settings, dataset, intervals, motion, seed, callback)
     try:
         found = _decided(contest, first, whole[2])
     except TimeLimitError:

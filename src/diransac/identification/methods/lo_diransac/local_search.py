@@ -12,7 +12,7 @@ MacKay 1992; Schwarz 1978 (the price of a scale).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
-from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
@@ -33,11 +33,11 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
+from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG
 from diransac.simulation import HOLDS
-from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
@@ -53,20 +53,14 @@ LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 
 # Difference of two fits' evidence, nats, below which both are as likely.
 _AS_LIKELY = 5.0
-# Delays, or lags, that are tried at a time, before a delay is refined to a sample.
-_AT_A_TIME = 12
-# Samples that the range of delays spans to either side at least, and at most.
-_SAMPLES_OF_DELAY = 2, 100
 # Shortest interval, samples.
 _SHORTEST = 3
 # Relative difference of parameters that makes a second start.
 _APART = 0.2
 # Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
-# Decrease of the log residuals of each signal by which a delay is worth to be tried.
-_SMALL_GAIN = 0.03
-# Delays, samples, of held inputs that vary between samples; shortest lag.
-_CONTINUOUS, _SHORTEST_LAG = (-0.9, -0.1), 0.5
+# Delays, samples, of held inputs that vary between samples.
+_CONTINUOUS = (-0.9, -0.1)
 
 
 @dataclass(frozen=True)
@@ -204,14 +198,13 @@ class LocalSearch:
 
     def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
-        required = self._required(intervals)
-        flexible = self._from_hypothesis(self._likeliest(intervals, required))
+        flexible = self._accurate(self._from_hypothesis(intervals))
         yield flexible
-        best = self._simplest(flexible)
+        best = self._accurate(self._simplest(flexible))
         yield best
-        named = [*required, *self._named(intervals)]
+        named = self._named(intervals)
         if named:
-            best = self._simplified(self._moved(best, best.intervals.with_errors(named)))
+            best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
             yield best
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
@@ -221,21 +214,17 @@ class LocalSearch:
                 trial = found[-1].trial or trial
             if not found:
                 break
-            best = min(found, key=lambda x: x.cost)
+            best = self._accurate(min(found, key=lambda x: x.cost))
             yield best
 
-    def _required(self, intervals: ShootingIntervals) -> list[ErrorKind]:
-        """The delay or the lag of all inputs, where the settings require it."""
-        settings = self.settings
-        required = {"delay": settings.input_delay, "lag": settings.input_lag}
-        return [intervals.all_inputs(what) for what in LATE if required[what]]
-
     def _named(self, intervals: ShootingIntervals) -> list[ErrorKind]:
-        """Errors of recordings that the settings name."""
+        """Errors of recordings that the settings name, or require of all inputs."""
         model, settings = intervals.model, self.settings
+        required = {"delay": settings.input_delay, "lag": settings.input_lag}
         signals, inputs = model.signals.index, list(model.inputs).index
         delays = settings.sensor_delays or ()
-        named = [ErrorKind((signals(x),), "delay") for x in delays if x not in model.inputs]
+        named = [intervals.all_inputs(what) for what in LATE if required[what]]
+        named += [ErrorKind((signals(x),), "delay") for x in delays if x not in model.inputs]
         named += [ErrorKind((inputs(x),), "delay", of_inputs=True) for x in delays if x in model.inputs]
         named += [ErrorKind((signals(x),), "bias") for x in settings.sensor_biases or ()]
         return [*named, *(ErrorKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ())]
@@ -278,7 +267,7 @@ class LocalSearch:
             if error.kind not in timings:
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
                 lag = replace(error, kind=replace(error.kind, what="lag"))
-                tried = [error, lag] if lag.kind in sought and error.size > _SHORTEST_LAG else [error]
+                tried = [error, lag] if lag.kind in sought and error.size > SHORTEST_LAG else [error]
                 found += [self._better(best, [self._with_errors(best, [x])], share, of_one=True) for x in tried]
         return [x for x in found if x is not best]
 
@@ -293,11 +282,10 @@ class LocalSearch:
         free_hold &= intervals.hold == "zero-order"
         if error is not None:
             found.append(intervals.with_input_error(error.kind, error.size))
-        if delay in sought:
-            tried = {self._late(intervals, delay, best.projected), round(late) - now if late else 0.0}
-            found += [intervals.with_input_error(delay, x) for x in tried if x]
+        if delay in sought and round(late) != now:
+            found.append(intervals.with_input_error(delay, round(late) - now))
         punctual = intervals.without_error(delay)
-        if lag in sought and lag not in sizes and late > _SHORTEST_LAG:
+        if lag in sought and lag not in sizes and late > SHORTEST_LAG:
             hold = "linear" if free_hold else intervals.hold
             found.append(replace(punctual.with_input_error(lag, late), hold=hold))
         if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
@@ -345,6 +333,17 @@ class LocalSearch:
         begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self.prior)
         return Explanation(refine(self.settings, intervals, begin, self.prior), exact=False)
 
+    def _accurate(self, found: Explanation) -> Explanation:
+        """The explanation with the fewest integration steps that it admits; fitted again if these are more."""
+        intervals, fit = found.intervals, found.refinement.fit
+        other = with_fewest_steps(intervals, fit, self.settings.substeps)
+        if other.substeps == intervals.substeps:
+            return found
+        again = with_residuals(other, fit)
+        if other.substeps > intervals.substeps:
+            return self._optimised(found, other, again)
+        return replace(found, refinement=replace(found.refinement, intervals=other, fit=again))
+
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""
         return found if found.exact else self._simplest(found)
@@ -391,7 +390,11 @@ class LocalSearch:
         return min(found, key=lambda x: x.cost, default=None)
 
     def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: float) -> Explanation | None:
-        """The exact model from a motion; None if simulations overflow from there."""
+        """The exact model from a motion, with all integration steps: it is one simulation of the whole log.
+
+        None if simulations overflow from there.
+        """
+        intervals = replace(intervals, substeps=self.settings.substeps)
         try:
             refined = refine_exact(self.settings, intervals, with_residuals(intervals, begin), self.prior, rival)
         except np.linalg.LinAlgError:
@@ -407,68 +410,6 @@ class LocalSearch:
         rho = fit.rho ** (1.0 / parts)
         begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
         return self._optimised(coarse, intervals, begin)
-
-    def _likeliest(self, intervals: ShootingIntervals, kinds: Iterable[ErrorKind]) -> ShootingIntervals:
-        """The intervals with the sizes of errors of inputs with which simulations by the best hypothesis agree best."""
-        for kind in kinds:
-            low, high = self.delays(intervals)
-            score = self._score(intervals, kind, self.hypotheses[0])
-            lags = np.geomspace(_SHORTEST_LAG, max(_SHORTEST_LAG, high), _AT_A_TIME).tolist()
-            size = min(lags, key=score) if kind.what == "lag" else _whole_samples(score, low, high)
-            intervals = intervals.with_input_error(kind, size)
-        return intervals
-
-    def delays(self, intervals: ShootingIntervals) -> tuple[int, int]:
-        """Earliest and latest delay, samples: those of the settings, but some samples at least and at most.
-
-        A controller's delay is of its own samples, which may be minutes, and microseconds are no reason for thousands.
-
-        Parameters
-        ----------
-        intervals : ShootingIntervals
-
-        Returns
-        -------
-        int, int
-            0 to a side on which the settings admit none.
-        """
-        low, high = self.settings.delay_range
-        least, most = _SAMPLES_OF_DELAY
-        early, late = (min(max(round(x / intervals.dt), least), most) if x > 0.0 else 0 for x in (-low, high))
-        return -early, late
-
-    def _late(self, intervals: ShootingIntervals, kind: ErrorKind, parameters: FloatArray) -> float:
-        """The likeliest further delay in whole samples; 0 if none is much likelier.
-
-        Inputs that are held for many samples and then step cause few outliers under a wrong delay, which is a local
-        optimum of the fit.
-        """
-        low, high = self.delays(intervals)
-        score = self._score(intervals, kind, parameters)
-        delay = _whole_samples(score, low, high)
-        return delay if score(0.0) - score(delay) > _SMALL_GAIN * intervals.known.any(axis=0).sum() else 0.0
-
-    def _score(self, intervals: ShootingIntervals, kind: ErrorKind, parameters: FloatArray) -> Callable[[float], float]:
-        """Score of simulations with further errors of inputs, by size."""
-
-        @cache
-        def score(size: float) -> float:
-            check_time()
-            trial = intervals.with_input_error(kind, size)
-            return float(robust_scores(trial, self.motion, parameters[None], np.arange(len(intervals)))[0])
-
-        return score
-
-
-def _whole_samples(score: Callable[[float], float], low: int, high: int) -> float:
-    """Number of samples between two others with the least score: the best of some, refined by bisection."""
-    step = max(1, (high - low) // (_AT_A_TIME - 1))
-    best = min(range(-(-low // step) * step, high + 1, step), key=lambda x: (score(float(x)), abs(x)))
-    while step > 1:
-        step = max(1, step // 2)
-        near = [x for x in (best - step, best, best + step) if low <= x <= high]
-        best = min(near, key=lambda x: (score(float(x)), abs(x)))
-    return float(best)
 
 
 def fewest_parts(length: int) -> int:

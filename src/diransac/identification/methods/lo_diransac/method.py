@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
+from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
@@ -30,7 +31,6 @@ from diransac.identification.methods.lo_diransac.projection import ProjectedEsti
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-from diransac.identification.methods.lo_diransac.structural import possible_terms
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -39,12 +39,12 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.refusal import check_signs
 from diransac.identification.structure.structural import check_structure, unidentifiable
-from diransac.process import memory_kept, single_threaded
+from diransac.process import memory_kept
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.missing_terms import MissingTerms
+    from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.parts import Change
     from diransac.identification.settings import Settings
@@ -86,9 +86,6 @@ class LoDiransac(LoDiransacSettings):
         Largest number of rows of each equation in a sample, over the number of parameters.
     n_screening_intervals, n_finalists : int, optional
         Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
-    delay_range : (float, float), optional
-        Smallest and largest delay of the inputs, s, tried in whole samples before local optimisation; where it is not
-        zero, 2 samples at least and 100 at most.
     input_delay, input_lag : bool, optional
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
         where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
@@ -101,8 +98,8 @@ class LoDiransac(LoDiransacSettings):
         Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
         is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
     substeps : int, optional
-        Integration steps per sample; one step is inaccurate by a percent where dry friction changes sign between
-        samples or links are light.
+        Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
+        One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
     max_steps : int, optional
         Largest number of Gauss-Newton steps of a local optimisation; 0: the best hypothesis is the estimate.
     outliers : bool, optional
@@ -163,7 +160,7 @@ class LoDiransac(LoDiransacSettings):
             The time limit was reached before the first local optimisation had converged.
         """
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
-        with single_threaded(), memory:  # matrices are small: more threads would only add waiting
+        with memory:
             return _fitted(self, dataset, int(seed), callback)
 
 
@@ -204,11 +201,11 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     predicts = best.decided is None or best.decided.summary.predicts
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
         check_signs(dataset, rows_of_logs(intervals, motion))
-    parts, lacks = compared_parts(likeliest, result), None
-    if settings.suggestions and not likeliest.exact:
-        from diransac.identification.methods.lo_diransac.missing_terms import missing_terms
-
-        lacks = missing_terms(intervals, refined.fit, result, settings.candidate_terms)
+    parts, candidates, lacks = compared_parts(likeliest, result), None, None
+    if settings.suggestions:
+        with suppress(np.linalg.LinAlgError):  # squares of tiny or huge numbers, of which no term can be tested
+            candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
+            lacks = None if likeliest.exact else missing_terms(candidates)
     ambiguity = _ambiguity(parts.changes, lacks, len(result.parameters))
     checks = (
         *_checks(settings, best),
@@ -216,7 +213,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *_checks_of_unmeasured(best),
         *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
-    found = _Found(dataset, best, result, ambiguity, lacks)
+    found = _Found(dataset, best, result, ambiguity, candidates, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     return _estimate(settings, found, end, checks)
@@ -287,14 +284,15 @@ def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
 class _Found:
     """Parts of an estimate.
 
-    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be; ``lacks``
-    is None where terms that the model lacks were not sought.
+    ``ambiguity (n, n)`` is a covariance besides that of the result, for what one set of parameters cannot be;
+    ``candidates`` is None where terms that the model lacks were not sought, ``lacks`` also where it is exact.
     """
 
     dataset: Dataset
     best: Searched
     result: ProjectedEstimate
     ambiguity: FloatArray
+    candidates: Candidates | None
     lacks: MissingTerms | None
 
     @property
@@ -312,8 +310,7 @@ class _Found:
 
 def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Finding, ...]) -> Estimate:
     dataset, best, result = found.dataset, found.best, found.result
-    intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
-    names = dataset.layout.names
+    intervals, names = best.likeliest.intervals, dataset.layout.names
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, best.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
@@ -342,9 +339,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if best.decided is None else best.decided.summary,
-        possible_terms=possible_terms(intervals, fit, result, covariance, settings.candidate_terms)
-        if settings.suggestions
-        else None,
+        possible_terms=possible_terms(found.candidates, result, covariance, names) if found.candidates else None,
         of_logs=best.decided.of_logs if best.decided else (),
     )
 

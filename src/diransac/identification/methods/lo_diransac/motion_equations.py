@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 __all__ = [
     "discrepancy_units",
     "equations_of_rows",
-    "inertia_slopes",
+    "inertia_of_motion",
     "inertial_forces",
     "means_of_intervals",
     "parameter_units",
     "residuals_of_motion",
+    "slopes_of_delays",
     "unexplained",
 ]
 
-# Relative change of a parameter for derivatives of the inertia, and the smallest parameter of which it is one.
-_DIFFERENCE = 1e-4
 _TINY = 1e-300
 
 
@@ -110,33 +109,44 @@ def equations_of_rows(
     return a, np.asarray(_matrices(_residual_map(model)(q, v, a, u, p)[1], model.n_p))
 
 
-def inertia_slopes(intervals: ShootingIntervals, motion: Sequence[FloatArray], rows: IntArray) -> FloatArray:
-    """Derivatives of ``M = dr/da`` with respect to the parameters in some rows, by differences.
+def inertia_of_motion(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
+    """``M = dr/da`` of other parameters in every row of a motion.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     motion : sequence of (N, ...) array
-        q, v, a, the inputs as they act, and the model's parameters in every row.
-    rows : (R,) int array
+        q, v, a, and the inputs as they act.
+    parameters : (n,) array
 
     Returns
     -------
-    (R, n_v, n_v, n) array
-        Columns in the places of each log's parameters.
+    (N, n_v, n_v) array
     """
-    model, (*at, p) = intervals.model, (x[rows] for x in motion)
+    M = _residual_map(intervals.model)(*motion[:4], _row_parameters(intervals, parameters))[2]
+    return _matrices(M, intervals.model.n_v)
 
-    def inertia(changed: FloatArray) -> FloatArray:
-        return _residual_map(model)(*at, changed)[2]
 
-    before, columns = inertia(p), []
-    for j in range(model.n_p):
-        changed = p.copy()
-        changed[:, j] += _DIFFERENCE * np.maximum(np.abs(p[:, j]), _DIFFERENCE)
-        columns.append((inertia(changed) - before) / (changed - p)[:, j : j + 1])
-    slopes = _by_log(intervals, np.stack(columns, axis=2), intervals.log_of_row[rows])
-    return np.asarray(slopes.reshape(len(rows), model.n_v, model.n_v, -1).swapaxes(1, 2))
+def slopes_of_delays(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
+    """Changes of the residuals per sample of a delay of each input.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : sequence of (N, ...) array
+        q, v, a, and the inputs as they act.
+    parameters : (n,) array
+
+    Returns
+    -------
+    (N, n_v, n_u) array
+    """
+    *state, inputs = motion[:4]
+    model, p, later = intervals.model, _row_parameters(intervals, parameters), intervals.later_inputs
+    before, found = _residual_map(model)(*state, inputs, p)[0], np.zeros((len(inputs), model.n_v, model.n_u))
+    for j, one in enumerate(np.eye(model.n_u)):
+        found[:, :, j] = _residual_map(model)(*state, inputs + later * one, p)[0] - before
+    return found
 
 
 def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:

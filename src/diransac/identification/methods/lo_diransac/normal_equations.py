@@ -40,6 +40,7 @@ __all__ = [
     "innovation_std",
     "innovations",
     "linearize",
+    "of_logs",
     "sum_in_places",
     "variances_of_intervals",
     "weights_of",
@@ -152,7 +153,7 @@ class NormalEquations:
         """
         n_x = fit.x.shape[1]
         z = np.hstack([moved.x - fit.x, moved.d - fit.d])
-        s = (moved.shared - fit.shared)[_places(intervals)[intervals.log_of]]
+        s = of_logs(intervals, moved.shared - fit.shared)
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
         return np.asarray(moved.jumps(intervals) - linear)
 
@@ -272,7 +273,7 @@ def variances_of_intervals(
     (W, n, n) array
     """
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
-    own = np.concatenate([z, s[_places(intervals)[intervals.log_of]]], axis=1)
+    own = np.concatenate([z, of_logs(intervals, s)], axis=1)
     return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
 
 
@@ -303,6 +304,21 @@ def _places(intervals: ShootingIntervals) -> IntArray:
     """Places of the shared unknowns of each log, (n_logs, n)."""
     rest = np.arange(intervals.n_p, intervals.n_shared)
     return np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
+
+
+def of_logs(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+    """Values of the shared unknowns of each interval's own log.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    values : (n_s, ...) array
+
+    Returns
+    -------
+    (W, n_own, ...) array
+    """
+    return np.asarray(values[_places(intervals)[intervals.log_of]])
 
 
 def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:

@@ -149,14 +149,15 @@ class Segments:
         -------
         RolloutBatch
         """
-        x, m = self.intervals, len(states)
-        logs = np.tile(x.log_of_row[self.starts], m)
-        own = parameters.reshape(m * len(self), -1)
+        n = len(states) * len(self)
+        return self._lanes(parameters.reshape(n, -1), states.reshape(n, -1), np.arange(n))
+
+    def _lanes(self, parameters: FloatArray, states: FloatArray, lanes: IntArray) -> RolloutBatch:
+        """Some lanes of a batch, each with its own parameters and state."""
+        x, starts = self.intervals, self.starts[lanes % len(self)]
         if not x.layout.is_shared:
-            own = np.take_along_axis(own, x.layout.index[logs], axis=1)
-        starts = np.tile(self.starts, m)
-        flat = states.reshape(m * len(self), -1)
-        return RolloutBatch(own, flat, self.acting.values, x.dt, starts, self.n_rows, x.first_of_log)
+            parameters = np.take_along_axis(parameters, x.layout.index[x.log_of_row[starts]], axis=1)
+        return RolloutBatch(parameters, states, self.acting.values, x.dt, starts, self.n_rows, x.first_of_log)
 
     def errors(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
         """Simulated less measured signals ``(m, K, n_rows, n_s)``, huge from a divergence on; arguments as `batch`."""
@@ -172,25 +173,28 @@ class Segments:
         return found.reshape(*states.shape[:2], self.n_rows, -1)
 
     def gauss_newton(
-        self, parameters: FloatArray, states: FloatArray, weights: FloatArray, *, parameters_too: bool
+        self, parameters: FloatArray, states: FloatArray, weights: FloatArray, lanes: IntArray | None = None
     ) -> GaussNewtonBatch:
-        """Least-squares sums of each lane with respect to its state, and then its parameters.
+        """Least-squares sums of each lane with respect to its state, and then its parameters; or of some, to the state.
 
         Parameters
         ----------
         parameters, states : array
-            As `batch`.
+            As `batch`; with ``lanes``, ``(k, n)`` and ``(k, n_x)``.
         weights : (N, n_s) array
             Of the compared signals in all rows.
-        parameters_too : bool
+        lanes : (k,) int array, optional
+            Lanes of a batch whose parameters are known.
 
         Returns
         -------
         GaussNewtonBatch
         """
         model = self.intervals.model
-        unknowns = (*model.state, *model.parameters) if parameters_too else tuple(model.state)
-        batch = self.batch(parameters, states)
+        if lanes is None:
+            batch, unknowns = self.batch(parameters, states), (*model.state, *model.parameters)
+        else:
+            batch, unknowns = self._lanes(parameters, states, lanes), tuple(model.state)
         return self._simulator.gauss_newton(
             batch, self.measurements, weights, unknowns=unknowns, threads=self.intervals.threads
         )
@@ -212,8 +216,9 @@ class Segments:
         -------
         (m, K, n_x) array
         """
-        flat = states.reshape(-1, states.shape[2])
-        found, _ = least_squares(_States(self, parameters, flat, spread, weights), flat, _STATE_STEPS)
+        flat, n = states.reshape(-1, states.shape[2]), parameters.shape[2]
+        problem = _States(self, parameters.reshape(-1, n), flat, spread, weights)
+        found, _ = least_squares(problem, flat, _STATE_STEPS)
         return found.reshape(states.shape)
 
 
@@ -230,10 +235,9 @@ class _States:
     def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
         return now + step
 
-    def linearized(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        states = z.reshape(*self.parameters.shape[:2], -1)
-        found = self.segments.gauss_newton(self.parameters, states, self.weights, parameters_too=False)
-        away = (z - self.mean) / self.spread
+    def linearized(self, z: FloatArray, lanes: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        found = self.segments.gauss_newton(self.parameters[lanes], z, self.weights, lanes)
+        away = (z - self.mean[lanes]) / self.spread
         cost, matrix = found.cost + np.square(away).sum(axis=1), found.normal_matrix + np.diag(self.spread**-2.0)
         return cost, found.gradient + away / self.spread, matrix
 

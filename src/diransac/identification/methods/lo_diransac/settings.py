@@ -38,7 +38,6 @@ class LoDiransacSettings:
     largest_sample: int = 4
     n_screening_intervals: int = 12
     n_finalists: int = 12
-    delay_range: tuple[float, float] = (-0.03, 0.08)
     input_delay: bool | None = None
     input_lag: bool | None = None
     sensor_delays: tuple[str, ...] | None = None
@@ -87,8 +86,6 @@ class LoDiransacSettings:
             )
         if self.input_delay and self.input_lag:
             raise SettingsError("input_delay and input_lag are both True; inputs act after a delay or after a lag")
-        if not -np.inf < self.delay_range[0] <= 0.0 <= self.delay_range[1] < np.inf:
-            raise SettingsError(f"delay_range is {self.delay_range}; give (earliest, latest) in s, with 0 between them")
 
     @property
     def forces_timing(self) -> bool:
@@ -135,12 +132,6 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         if not isinstance(value, bool):
             raise SettingsError(f"{name} is {value!r}; give True or False")
         return value
-    if isinstance(default, tuple):
-        try:
-            low, high = (float(x) for x in value)
-        except (TypeError, ValueError) as error:
-            raise SettingsError(f"{name} is {value!r}; give two numbers") from error
-        return low, high
     kinds = (int, np.integer) if isinstance(default, int) else (int, float, np.number)
     if isinstance(value, bool) or not isinstance(value, kinds) or not np.isfinite(value):
         raise SettingsError(f"{name} is {value!r}; give a {'whole ' if isinstance(default, int) else ''}number {least}")

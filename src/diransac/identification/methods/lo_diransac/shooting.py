@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["ShootingIntervals"]
+__all__ = ["SHORTEST_LAG", "ShootingIntervals"]
+
+SHORTEST_LAG = 0.5
+"""Time constant, samples, from which on an actuator's lag shows."""
 
 _DIVERGED = 1e6
 _WELL_CONDITIONED = 1e8
@@ -276,8 +279,9 @@ class ShootingIntervals:
         return replace(self, errors=self.all_errors.plus({kind: size}))
 
     def with_errors(self, kinds: Iterable[ErrorKind]) -> ShootingIntervals:
-        """The intervals with further errors of the recordings, none of a size yet."""
-        return replace(self, errors=self.all_errors.plus(dict.fromkeys(kinds, 0.0)))
+        """The intervals with further errors of the recordings, none of a size yet; lags, which have a sign, of one."""
+        begin = {kind: SHORTEST_LAG if kind.what == "lag" else 0.0 for kind in kinds}
+        return replace(self, errors=self.all_errors.plus(begin))
 
     def without_error(self, kind: ErrorKind) -> ShootingIntervals:
         """The intervals without an error of an input."""

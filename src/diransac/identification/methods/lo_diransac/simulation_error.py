@@ -276,7 +276,7 @@ class _Solution:
         segments, (K, n_x) = self.segments, self.states.shape
         inlying = self.noise.inlying(self.errors, self._known).reshape(segments.known.shape)
         weights = segments.weights(inlying / np.square(self.noise.sigma))
-        sums = segments.gauss_newton(*self._lanes, weights, parameters_too=True)
+        sums = segments.gauss_newton(*self._lanes, weights)
         own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
         at = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own])
         H, g = np.zeros((K, *2 * (n_x + len(self.parameters),))), np.zeros((K, n_x + len(self.parameters)))
