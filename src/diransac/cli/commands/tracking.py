@@ -84,7 +84,7 @@ class TrackerOptions:
         return Path(self.rough) if self.rough is not None and self.rough.endswith(".json") else None
 
     def start(self, model: str) -> Result | dict[str, float] | None:
-        """Where the tracker starts."""
+        """Start of the tracker."""
         file = self.start_file()
         if file is None and self.rough is None and model.endswith(".json"):
             file = Path(model)

@@ -95,7 +95,7 @@ def growing(path: Path, reading: Reading, like: Sequence[Mapping[str, Any]] = ()
 
 
 class Bytes(Protocol):
-    """Where bytes come from."""
+    """Source of bytes."""
 
     ended: bool
 

@@ -1,4 +1,4 @@
-"""What a tracker returns: `TrackedEstimate`, one a step, and the `Change` of a parameter that it reports once."""
+"""Values that a tracker returns: `TrackedEstimate`, one a step, and `Change`, which it reports once."""
 
 from __future__ import annotations
 

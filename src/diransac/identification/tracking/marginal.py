@@ -21,7 +21,7 @@ _RIDGE = 1e-13
 
 
 def marginal(at: NormalEquations, intervals: ShootingIntervals, fit: Fit, n: int) -> BoundaryPrior:
-    """What the first intervals of a fit, and its boundary, tell of the unknowns at the start of the next one.
+    """Information of the first intervals of a fit, and its boundary, on the unknowns at the start of the next one.
 
     Parameters
     ----------

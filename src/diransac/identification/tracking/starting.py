@@ -1,4 +1,4 @@
-"""Where a window begins: smoothed states of its intervals, and a first fit with the parameters of a start."""
+"""Beginning of a window: smoothed states of its intervals, and a first fit with the parameters of a start."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class Window:
         free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
         boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
-        # What the change seemed to be until it was found, outliers or forces, is no habit of the machine.
+        # Outliers and forces for which the change was taken until it was found are forgotten.
         self.memory = self._memories[-min(len(self.times) + 1, len(self._memories))]
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)

@@ -1,4 +1,4 @@
-"""What is known when a window of a log begins: a Gaussian of its first unknowns and of the shared ones.
+"""Knowledge from before a window of a log: a Gaussian of its first unknowns and of the shared ones.
 
 Intervals that have left a window are marginalised: the Schur complement of their block of the normal equations remains
 as a prior of the state and the unmodelled accelerations at the start of the interval that follows, and of the shared
