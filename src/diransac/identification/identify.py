@@ -399,12 +399,14 @@ def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
 def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     """The result with findings on mistakes of columns: contradictions, and what explains a bad answer.
 
-    An answer is doubtful, too, where much is unexplained or a parameter that must not be zero may be.
+    An answer is doubtful, too, where much is unexplained, or a parameter that must not be zero may be if a term lacks.
     """
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
     is_bad, n_tested = result.verdict == "do not rely on this", 0
     parameters = result.model.parameters
-    lost = [n for n, (low, high) in result.intervals().items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
+    tested = result.estimate.possible_terms is not None
+    intervals = result.structural_intervals() if tested else result.intervals()
+    lost = [n for n, (low, high) in intervals.items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
     # A quarter of an acceleration that is unexplained is a reason to test columns.
     is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25
     if is_doubtful:
