@@ -8,7 +8,9 @@
 | `setup.py` | the problem, and intervals of a stream |
 | `starting.py`, `cold_start.py` | the first window, and a start by the default method |
 | `window.py`, `marginal.py` | the fit of the last intervals, and what remains of those before |
-| `changes.py` | steps and drifts of parameters |
+| `changes.py` | steps and drifts of parameters: tested, released, reported |
+| `step_tests.py`, `forces.py`, `drift.py`, `doubt.py` | their tests; forces; rates; changes that remain possible |
+| `surprise.py` | outliers where a machine may have changed |
 | `sensors.py` | sensors that stop |
 """
 

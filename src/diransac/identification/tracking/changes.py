@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.tracking.doubt import Doubt
 from diransac.identification.tracking.drift import Drift
 from diransac.identification.tracking.estimates import Change
 from diransac.identification.tracking.forces import explanations_by_forces, with_forces
@@ -22,8 +23,6 @@ __all__ = ["Changes"]
 
 # Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
 _MEMORY, _AS_EXPECTED = 60.0, 20.0
-# Change of a parameter that is expected of a machine, over the parameter.
-_USUAL_CHANGE = 1.0
 # Standard errors within which a parameter has returned to an earlier value.
 _RETURNED = 3.0
 # Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
@@ -76,6 +75,7 @@ class Changes:
         self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
         self._usual: FloatArray | None = None
         self._full = False
+        self._doubt = Doubt(len(self.names))
         self._before = np.full(len(self.names), np.inf)
         self._anchor, self._since = np.zeros((2, len(self.names))), np.zeros(len(self.names))
         self._is_said = np.zeros(len(self.names), bool)
@@ -91,8 +91,9 @@ class Changes:
         """Test for changes, release a parameter that has changed, and report what is determined."""
         of_calm = with_forces(found, *self._usual_forces(window))
         tests = change_tests(of_calm, ages_of(len(window)))
-        gain = self._gain(tests, self._scatter(tests.ages, len(window)), window).max()
+        gain = tests.gain(window.fit.shared, self._scatter(tests.ages, len(window))).max()
         is_full = len(window) == window.most
+        self._doubt.update(tests, window.fit.shared, [x.index for x in self._pending], full=is_full)
         self._full |= is_full
         if is_full:
             self._learn_drift(window, tests)
@@ -149,13 +150,6 @@ class Changes:
         information[[x.index for x in self._pending]] = 0.0
         self.drift.learn(window.fit.shared, tests.size[0, -1], information, T, self.step / T)
 
-    def _gain(self, tests: ChangeTests, scatter: FloatArray, window: Window) -> FloatArray:
-        """Logarithms ``(2, A, n)`` of the Bayes factors of the changes, as eq. (8) of `docs/method.md`."""
-        information = tests.information / scatter
-        prior = np.square(_USUAL_CHANGE * window.fit.shared) * information
-        ratio = np.square(tests.size) * information
-        return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
-
     # ------------------------------------------------------------------ a change
 
     def _decide(self, window: Window, found: Linearization) -> None:
@@ -166,7 +160,7 @@ class Changes:
         for scaled, evidence in explanations_by_forces(found, window.expected):
             without = max(without, evidence)
             fine = change_tests(scaled, ages)
-            gain = evidence + self._gain(fine, scatter, window)
+            gain = evidence + fine.gain(window.fit.shared, scatter)
             if gain.max() > best.evidence:
                 kind, age, index = (int(x) for x in np.unravel_index(np.argmax(gain), gain.shape))
                 size, known = float(fine.size[kind, age, index]), float(fine.information[kind, age, index])
@@ -177,7 +171,9 @@ class Changes:
         self._drift_by(window, best)
         first = len(window) - best.age
         time = float(window.times[first])
-        value, error = window.release(first, best.index, found.fit.shared + best.shift, best.size)
+        before = found.fit.shared + best.shift
+        self._doubt.since(best.size / before[best.index])
+        value, error = window.release(first, best.index, before, best.size)
         self._pending = [x for x in self._pending if x.index != best.index]
         self._pending.append(_Pending(best.index, time, value, error))
 
@@ -205,7 +201,7 @@ class Changes:
     def _follow_drift(self, window: Window) -> None:
         """Report each drift once, when a parameter has moved further than chance moves it."""
         now = float(window.times[-1] + window.length * window.stream.dt)
-        values, errors = window.fit.shared, np.sqrt(np.diag(self.covariance(window)))
+        values, errors = window.fit.shared, np.sqrt(np.diag(self._without_doubt(window)))
         still = ~self.drift.drifting | np.isin(np.arange(len(values)), [x.index for x in self._pending])
         self._since = np.where(still, now, self._since)
         self._anchor = np.where(still, [values, errors], self._anchor)
@@ -234,10 +230,11 @@ class Changes:
         self._new.append(change)
 
     def covariance(self, window: Window) -> FloatArray:
-        """Covariance of the parameters at the end of the window.
+        """Covariance of the parameters at the end of the window, with changes that it cannot exclude."""
+        return self._without_doubt(window) + np.diag(self._doubt.variance)
 
-        It includes their drift during the window, and is larger where windows scatter more than their covariances.
-        """
+    def _without_doubt(self, window: Window) -> FloatArray:
+        """Covariance with the drift during the window, larger where windows scatter more than their covariances."""
         assert window.last is not None
         drift = np.diag(self.drift.rate * self._duration(window) / 3.0)
         more = np.sqrt(np.maximum(self._squares[0, -1] / self._counts[0, -1], 1.0))

@@ -78,9 +78,10 @@ class ColdStart:
             self._needed = min(2.0 * self._needed, len(stream.values) * stream.dt - self.window)
             return None
         resolution = result.estimate.resolution
-        setup = replace(self.setup, hold=resolution.hold, timing=resolution.timing)
+        setup = replace(self.setup, timing=resolution.timing)
         said = f"identified from the first {self._needed:.3g} s ({result.verdict})"
-        return Found(setup, Start(np.array(list(result.parameters.values()))), (said,))
+        start = Start(np.array(list(result.parameters.values())), holds=(resolution.hold,))
+        return Found(setup, start, (said,))
 
     def _identified(self, stream: Stream, first: int, end: int) -> Future[Result]:
         """The identification of some rows, which runs."""

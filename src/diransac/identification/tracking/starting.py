@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,8 @@ __all__ = ["Start", "begun", "smoothed_motion"]
 
 # Prior standard deviation of a parameter of which only a rough value is known, over the value.
 _ROUGH = 1.0
+# Evidence, nats, by which inputs that are interpolated must be likelier than held ones; as in `local_search`.
+_AS_LIKELY = 5.0
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,13 @@ class Start:
     parameters : (n_p,) array
     covariance : (n_p, n_p) array, optional
         None of rough values.
+    holds : tuple of str, optional
+        What inputs may do between samples, of `HOLDS`; the first one unless another is clearly likelier.
     """
 
     parameters: FloatArray
     covariance: FloatArray | None = None
+    holds: tuple[str, ...] = ("zero-order", "smooth")
 
 
 def smoothed_motion(setup: Setup, stream: Stream, first: int, n_rows: int) -> Motion:
@@ -103,8 +108,25 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     """
     length = stream.length // stream.parts
     motion = smoothed_motion(setup, stream, first, n * length)
-    intervals = setup.intervals(stream, first, n)
-    p = given.parameters
+    first_hold, *others = given.holds
+    best = _fitted(replace(setup, hold=first_hold), stream, first, n, given, motion)
+    for hold in others:
+        other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
+        best = other if other.cost < best.cost - _AS_LIKELY else best
+    return Window(best.setup, stream, first, best.fit, motion.spread, most)
+
+
+class _Begun(NamedTuple):
+    """Fit of the first intervals, and its negative log evidence."""
+
+    setup: Setup
+    fit: Fit
+    cost: float
+
+
+def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, motion: Motion) -> _Begun:
+    """Fit of the first n intervals of a stream from the parameters of a start."""
+    intervals, p = setup.intervals(stream, first, n), given.parameters
     if given.covariance is None:
         unit = parameter_units(intervals, motion, p)
         covariance = np.diag(np.square(_ROUGH * np.maximum(np.abs(p), np.where(unit > 0.0, unit, 1.0))))
@@ -115,8 +137,8 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     priors = {name: (float(x), float(s)) for name, x, s in zip(names, p, std, strict=True)}
     with_prior = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
     prior = make_prior(setup.settings, with_prior, motion, np.full(len(p), np.inf))
-    fit = refine(setup.settings, with_prior, start(setup.settings, with_prior, motion, p, prior), prior).fit
-    return Window(setup, stream, first, _with_boundary(fit, p, covariance), motion.spread, most)
+    found = refine(setup.settings, with_prior, start(setup.settings, with_prior, motion, p, prior), prior)
+    return _Begun(setup, _with_boundary(found.fit, p, covariance), found.cost)
 
 
 def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:

@@ -28,6 +28,8 @@ __all__ = ["ChangeTests", "ages_of", "change_tests", "fine_ages_of"]
 _DETERMINED = 1e-9
 # Ratio of neighbouring ages of changes that are compared.
 _FINELY = 1.2
+# Change of a parameter that is expected of a machine, over the parameter.
+_USUAL_CHANGE = 1.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,25 @@ class ChangeTests:
     def ratio(self) -> FloatArray:
         """Sizes over their standard errors, (2, A, n)."""
         return self.size * np.sqrt(self.information)
+
+    def gain(self, values: FloatArray, scatter: FloatArray | float = 1.0) -> FloatArray:
+        """Logarithms of the Bayes factors of the changes, as eq. (8) of `docs/method.md`.
+
+        Parameters
+        ----------
+        values : (n,) array
+            Parameters.
+        scatter : (2, A, n) array or float, optional
+            Variance of the ratios where nothing changes.
+
+        Returns
+        -------
+        (2, A, n) array
+        """
+        information = self.information / scatter
+        prior = np.square(_USUAL_CHANGE * values) * information
+        ratio = np.square(self.size) * information
+        return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
 
 
 def ages_of(n: int) -> IntArray:

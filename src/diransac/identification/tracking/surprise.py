@@ -27,7 +27,9 @@ __all__ = ["is_surprised", "weights_of_free_motion"]
 # Standard deviations of the number of outliers that are a surprise; and the intervals in which they are counted.
 _SURPRISE, _LAST = 4.0, 2
 # Time that the motion is followed, s, and steps until its outliers are found.
-_FOLLOWED, _STEPS = 1.0, 4
+_FOLLOWED, _STEPS = 1.0, 6
+# Part of the samples of a second that are no outliers at least, and what this quantile is of |x|, x standard normal.
+_INLYING, _OF_NORMAL = 0.75, 1.15
 # Standard deviation of parameters that are held, over their values.
 _HELD = 1e-6
 
@@ -76,9 +78,12 @@ def weights_of_free_motion(window: Window) -> FloatArray:
 
 
 def _followed(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit after some steps with scales that are held."""
-    damping = 0.0
+    """The fit after some steps, with noise as large as the residuals of each at first: none starts as an outlier."""
+    usual, damping = fit.noise, 0.0
     for _ in range(_STEPS):
+        samples = zip(np.abs(fit.residuals).T, intervals.known.T, strict=True)
+        scale = [np.quantile(x[k], _INLYING) / _OF_NORMAL if k.any() else 0.0 for x, k in samples]
+        fit = replace(fit, noise=replace(usual, sigma=np.maximum(usual.sigma, scale)))
         taken = gauss_newton_step(intervals, fit, linearized(intervals, fit), damping)
         fit, damping = taken.fit, taken.damping
-    return fit
+    return replace(fit, noise=usual)

@@ -368,5 +368,5 @@ def _started(setup: Setup, start: Mapping[str, float] | Result) -> tuple[Setup, 
             f"start has the parameters {', '.join(start.parameters)}, the model has {', '.join(parameters)}"
         )
     resolution = start.estimate.resolution
-    given = Start(np.array(list(start.parameters.values()))[free], start.covariance[np.ix_(free, free)])
-    return replace(setup, hold=resolution.hold, timing=resolution.timing), given
+    known, covariance = np.array(list(start.parameters.values()))[free], start.covariance[np.ix_(free, free)]
+    return replace(setup, timing=resolution.timing), Start(known, covariance, (resolution.hold,))

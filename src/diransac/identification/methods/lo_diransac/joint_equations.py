@@ -227,8 +227,9 @@ class Scores:
         n = len(self.intervals)
         batches = np.add.reduceat(tests.scores[:, k], np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
-        gain = 0.5 * score**2 / information
-        return RecordingError(slope.kind, -score / information, float(np.sqrt(variance)) / information, gain)
+        size = -score / information
+        gain = -0.5 * score * size  # which overflows where the rollouts of a fit nearly do
+        return RecordingError(slope.kind, size, float(np.sqrt(variance)) / information, gain) if gain < np.inf else None
 
 
 @dataclass(frozen=True)
