@@ -9,9 +9,10 @@ import ctypes
 import os
 import sys
 import threading
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -49,8 +50,15 @@ def _nothing() -> None:
     """Undo nothing."""
 
 
+@lru_cache(maxsize=1)
+def _thread_pools(_n_modules: int) -> ThreadpoolController:
+    """The thread pools of the loaded libraries: searched for, in milliseconds, once for the modules there are."""
+    return ThreadpoolController()
+
+
 def _one_blas_thread() -> Callable[[], object]:
-    undo: Callable[[], object] = threadpool_limits(limits=1, user_api="blas").restore_original_limits
+    limited = _thread_pools(len(sys.modules)).limit(limits=1, user_api="blas")
+    undo: Callable[[], object] = limited.restore_original_limits
     return undo
 
 

@@ -11,6 +11,7 @@ from diransac.arrays import FloatArray
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.log import Log
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
+from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
@@ -113,7 +114,9 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     for hold in others:
         other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
         best = other if other.cost < best.cost - _AS_LIKELY else best
-    return Window(best.setup, stream, first, best.fit, motion.spread, most)
+    few = with_fewest_steps(best.setup.intervals(stream, first, n), best.fit, setup.settings.substeps).substeps
+    begun_setup = replace(best.setup, settings=replace(setup.settings, substeps=few))
+    return Window(begun_setup, stream, first, best.fit, motion.spread, most)
 
 
 class _Begun(NamedTuple):
