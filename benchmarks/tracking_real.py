@@ -5,8 +5,8 @@
 ``emps``
     a servo axis, 24 s at 1 kHz: nothing changes;
 ``emps-spliced``
-    the same with a recorded force that is divided by 1.3 from half of the record on, as after a change of a drive's
-    gain: every parameter drops by 23 %;
+    the same twice, with a recorded force that is divided by 1.3 from the middle of the second time on, as after a
+    change of a drive's gain: every parameter drops by 23 %;
 ``crazyflie-log15``, ``crazyflie-log16``
     thrust and lag of the rotors, from the accelerometer and the motor commands of a flight of a minute.
 
@@ -43,11 +43,12 @@ def emps() -> Replayed:
 
 
 def emps_spliced() -> Replayed:
-    """The servo axis with another gain of its drive in the second half."""
+    """The servo axis twice, with another gain of its drive from the middle of the second time on."""
     model, log = emps()
-    half = 0.5 * (log.time[0] + log.time[-1])
-    force = np.where(log.time < half, log["force"], log["force"] / FACTOR)
-    return model, dr.Log.from_arrays(log.time, {"position": log["position"], "force": force})
+    duration = log.time[-1] - log.time[0] + log.dt
+    time = np.concatenate([log.time, log.time + duration])
+    force = np.tile(log["force"], 2) / np.where(time - time[0] < 1.5 * duration, 1.0, FACTOR)
+    return model, dr.Log.from_arrays(time, {"position": np.tile(log["position"], 2), "force": force})
 
 
 def crazyflie(name: str) -> Replayed:

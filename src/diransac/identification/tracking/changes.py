@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.tracking.doubt import Doubt
 from diransac.identification.tracking.drift import Drift
 from diransac.identification.tracking.estimates import Change
@@ -16,13 +16,16 @@ from diransac.identification.tracking.forces import explanations_by_forces, with
 from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
 
 if TYPE_CHECKING:
+    from diransac.data.dataset import ParameterLayout
     from diransac.identification.tracking.setup import Setup
     from diransac.identification.tracking.window import Linearization, Window
 
 __all__ = ["Changes"]
 
-# Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
-_MEMORY, _AS_EXPECTED = 60.0, 20.0
+# Time over which the scatter of the tests is remembered, and for which tests as they should be count beside it, s.
+_MEMORY, _AS_EXPECTED = 60.0, 10.0
+# Windows from whose tests their scatter is known, where the model has not been exact.
+_LEARNED = 3.0
 # Standard errors within which a parameter has returned to an earlier value.
 _RETURNED = 3.0
 # Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
@@ -43,15 +46,43 @@ class _Pending:
 
 @dataclass(frozen=True)
 class _Explanation:
-    """A change that explains a window, and its evidence, nats; the shift is that of all parameters before it."""
+    """Changes of some parameters at a time that explain a window.
+
+    Parameters
+    ----------
+    evidence : float
+        nats
+    tests : ChangeTests
+        Of the window with some unmodelled forces.
+    age : int
+        Place of the age.
+    chosen : (n,) bool array
+        Parameters that change; none of a ramp, which is no step.
+    """
 
     evidence: float
-    kind: int = 0
-    age: int = 0
-    index: int = 0
-    size: float = 0.0
-    information: float = 0.0
-    shift: FloatArray = field(default_factory=lambda: np.zeros(0))
+    tests: ChangeTests
+    age: int
+    chosen: BoolArray
+
+
+def _explanation(
+    tests: ChangeTests, values: FloatArray, scatter: FloatArray, evidence: float, layout: ParameterLayout
+) -> _Explanation:
+    """The likeliest change, beside the evidence of a window without any; one to outside the bounds explains nothing."""
+    single = tests.gain(values, scatter)
+    single[0][~np.stack([layout.admits(values + x * np.eye(len(x))) for x in tests.size[0]])] = 0.0
+    of_steps, chosen = tests.steps_at_once(values, scatter[0])
+    for age, few in enumerate(chosen):
+        changed = values.copy()
+        changed[few] += tests.sizes(age, few)
+        if layout.violations(changed):
+            best = int(np.argmax(single[0, age]))
+            of_steps[age], chosen[age] = single[0, age, best], np.arange(len(values)) == best
+    age, of_ramp = int(np.argmax(of_steps)), float(single[_RAMP].max())
+    if of_ramp > of_steps[age]:
+        return _Explanation(evidence + of_ramp, tests, age, np.zeros(len(values), bool))
+    return _Explanation(evidence + float(of_steps[age]), tests, age, chosen[age])
 
 
 class Changes:
@@ -68,13 +99,13 @@ class Changes:
     """
 
     def __init__(self, setup: Setup, step: float, false_alarms_per_hour: float, drift: Mapping[str, float]) -> None:
-        self.names = tuple(setup.model.parameters)
+        self.names, self._layout = tuple(setup.model.parameters), setup.layout
         self.step, self.false_alarms = step, false_alarms_per_hour
         self.drift = Drift(self.names, drift)
         shape = (2, _MOST_AGES, len(self.names))
-        self._squares, self._counts = np.full(shape, _AS_EXPECTED), np.full(shape, _AS_EXPECTED)
+        self._squares, self._counts = np.zeros(shape), np.zeros(shape)
+        self._learned = 0.0
         self._usual: FloatArray | None = None
-        self._full = False
         self._doubt = Doubt(len(self.names))
         self._before = np.full(len(self.names), np.inf)
         self._anchor, self._since = np.zeros((2, len(self.names))), np.zeros(len(self.names))
@@ -90,19 +121,26 @@ class Changes:
     def after_step(self, window: Window, found: Linearization) -> None:
         """Test for changes, release a parameter that has changed, and report what is determined."""
         of_calm = with_forces(found, *self._usual_forces(window))
-        tests = change_tests(of_calm, ages_of(len(window)))
-        gain = tests.gain(window.fit.shared, self._scatter(tests.ages, len(window))).max()
         is_full = len(window) == window.most
+        tests = change_tests(of_calm, self._ages(window))
+        gain = tests.gain(window.fit.shared, self._scatter(tests.ages, len(window))).max()
         self._doubt.update(tests, window.fit.shared, [x.index for x in self._pending], full=is_full)
-        self._full |= is_full
         if is_full:
             self._learn_drift(window, tests)
-        if self._full and gain > self._price(tests.ages):
-            self._decide(window, of_calm)
-        elif is_full:
+            self._learned += np.inf if window.is_exact or window.setup.exact else self.step
+        calibrated = self._learned > _LEARNED * self._duration(window)
+        fires = gain > self._price(tests.ages)
+        if is_full and not (fires and calibrated):
             self._learn_scatter(tests)
+        if calibrated and fires:
+            self._decide(window, of_calm)
         self._report(window)
         self._follow_drift(window)
+
+    def _ages(self, window: Window, ages: Callable[[int], IntArray] = ages_of) -> IntArray:
+        """Ages of changes that are tested: where a change has begun the window, those that came with it."""
+        n = len(window)
+        return ages(n) if n == window.most else np.array([n])
 
     def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
         """Size and correlation ``(n_v,)`` of the unmodelled accelerations from before the window.
@@ -127,10 +165,12 @@ class Changes:
         per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
         return float(np.log(per_hour / self.false_alarms))
 
-    def _scatter(self, ages: IntArray, n: int) -> FloatArray:
+    def _scatter(self, ages: IntArray, n: int, as_expected: float = _AS_EXPECTED) -> FloatArray:
         """Variance ``(2, A, n_p)`` of the ratios of tests of some ages in n intervals, as remembered; 1 at least."""
         places = self._places(ages, n)
-        return np.asarray(np.maximum(self._squares[:, places] / self._counts[:, places], 1.0))
+        expected = as_expected / (ages[:, None] * self.step)
+        found = (self._squares[:, places] + expected) / (self._counts[:, places] + expected)
+        return np.asarray(np.maximum(found, 1.0))
 
     def _places(self, ages: IntArray, n: int) -> IntArray:
         """Places ``(A,)`` of ages in what is remembered: by powers of two; the last one is that of a whole window."""
@@ -138,11 +178,12 @@ class Changes:
 
     def _learn_scatter(self, tests: ChangeTests) -> None:
         """Remember the scatter of the tests of a full window."""
-        places = self._places(tests.ages, int(tests.ages[-1]))
-        seen = np.square(tests.ratio), tests.information > 0.0
+        n = int(tests.ages[-1])
+        places, most = self._places(tests.ages, n), 2.0 * self._price(tests.ages) * self._scatter(tests.ages, n)
+        seen = np.minimum(np.square(tests.ratio), most), tests.information > 0.0
         faded = np.exp(-self.step / _MEMORY)
         for sums, new in zip((self._squares, self._counts), seen, strict=True):
-            sums[:, places] = _AS_EXPECTED + faded * (sums[:, places] - _AS_EXPECTED) + new / tests.ages[:, None]
+            sums[:, places] = faded * sums[:, places] + new / tests.ages[:, None]
 
     def _learn_drift(self, window: Window, tests: ChangeTests) -> None:
         """Remember how much a full window differs from what was known before it."""
@@ -154,43 +195,41 @@ class Changes:
 
     def _decide(self, window: Window, found: Linearization) -> None:
         """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
-        best, without = _Explanation(-np.inf), -np.inf
-        ages = fine_ages_of(len(window))
+        best: _Explanation | None = None
+        without = -np.inf
+        values, ages = window.fit.shared, self._ages(window, fine_ages_of)
         scatter = self._scatter(ages, len(window))
         for scaled, evidence in explanations_by_forces(found, window.expected):
             without = max(without, evidence)
-            fine = change_tests(scaled, ages)
-            gain = evidence + fine.gain(window.fit.shared, scatter)
-            if gain.max() > best.evidence:
-                kind, age, index = (int(x) for x in np.unravel_index(np.argmax(gain), gain.shape))
-                size, known = float(fine.size[kind, age, index]), float(fine.information[kind, age, index])
-                shift = size * fine.shift[kind, age, index]
-                best = _Explanation(float(gain.max()), kind, int(ages[age]), index, size, known, shift)
-        if best.evidence - without < self._price(ages_of(len(window))) or best.kind == _RAMP:
+            one = _explanation(change_tests(scaled, ages), values, scatter, evidence, self._layout)
+            best = one if best is None or one.evidence > best.evidence else best
+        assert best is not None
+        if best.evidence - without < self._price(ages_of(len(window))) or not best.chosen.any():
             return
-        self._drift_by(window, best)
-        first = len(window) - best.age
+        tests, places = best.tests, np.flatnonzero(best.chosen)
+        sizes = tests.sizes(best.age, best.chosen)
+        self._drift_by(window, tests, best)
+        first = len(window) - int(tests.ages[best.age])
         time = float(window.times[first])
-        before = found.fit.shared + best.shift
-        self._doubt.since(best.size / before[best.index])
-        value, error = window.release(first, best.index, before, best.size)
-        self._pending = [x for x in self._pending if x.index != best.index]
-        self._pending.append(_Pending(best.index, time, value, error))
+        before = found.fit.shared + sizes @ tests.shift[0, best.age, places]
+        self._doubt.since(float(np.abs(sizes / before[places]).max()))
+        known = window.release(first, places, before, sizes)
+        self._pending = [x for x in self._pending if x.index not in places]
+        self._pending += [_Pending(int(k), time, *of_it) for k, of_it in zip(places, known, strict=True)]
 
-    def _drift_by(self, window: Window, change: _Explanation) -> None:
-        """Count a step as one of a drift, which steps that follow one another are."""
-        size, information = np.zeros(len(self.names)), np.zeros(len(self.names))
-        size[change.index], information[change.index] = change.size, change.information
-        self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0)
+    def _drift_by(self, window: Window, tests: ChangeTests, change: _Explanation) -> None:
+        """Count steps as those of a drift, which steps that follow one another are."""
+        information = np.where(change.chosen, tests.information[0, change.age], 0.0)
+        self.drift.learn(window.fit.shared, tests.size[0, change.age], information, self._duration(window), 1.0)
 
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""
         errors, now = np.sqrt(np.diag(self.covariance(window))), window.times[-1] + window.length * window.stream.dt
-        significant = self._significant(window)
+        significant, at_bound = self._significant(window), self._layout.on_bounds(window.fit.shared)
         for one in list(self._pending):
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
-            settled = abs(after - self._before[one.index]) < error
+            settled = abs(after - self._before[one.index]) < error and not at_bound[one.index]
             if settled and change > significant * both:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
@@ -237,7 +276,8 @@ class Changes:
         """Covariance with the drift during the window, larger where windows scatter more than their covariances."""
         assert window.last is not None
         drift = np.diag(self.drift.rate * self._duration(window) / 3.0)
-        more = np.sqrt(np.maximum(self._squares[0, -1] / self._counts[0, -1], 1.0))
+        n = len(window)
+        more = np.sqrt(self._scatter(np.array([n]), n, _MEMORY)[0, -1])
         return np.asarray((window.last.solved.var_p + drift) * np.outer(more, more))
 
     def taken(self) -> tuple[Change, ...]:

@@ -78,7 +78,7 @@ class ColdStart:
             self._needed = min(2.0 * self._needed, len(stream.values) * stream.dt - self.window)
             return None
         resolution = result.estimate.resolution
-        setup = replace(self.setup, timing=resolution.timing)
+        setup = replace(self.setup, timing=resolution.timing, exact=result.estimate.competition is None)
         said = f"identified from the first {self._needed:.3g} s ({result.verdict})"
         start = Start(np.array(list(result.parameters.values())), holds=(resolution.hold,))
         return Found(setup, start, (said,))

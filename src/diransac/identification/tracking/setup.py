@@ -39,6 +39,8 @@ class Setup:
         Delay and lag after which recorded inputs act.
     settings : LoDiransacSettings, optional
         Of the joint fit.
+    exact : bool, optional
+        Whether an identification has predicted its logs within their noise.
     """
 
     model: Model
@@ -46,6 +48,7 @@ class Setup:
     hold: str = "zero-order"
     timing: InputTiming = field(default_factory=InputTiming)
     settings: LoDiransacSettings = field(default_factory=LoDiransacSettings)
+    exact: bool = False
 
     @property
     def n_signals(self) -> int:

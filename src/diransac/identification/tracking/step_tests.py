@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from diransac.identification.tracking.window import Linearization
@@ -30,6 +30,9 @@ _DETERMINED = 1e-9
 _FINELY = 1.2
 # Change of a parameter that is expected of a machine, over the parameter.
 _USUAL_CHANGE = 1.0
+# Evidence, nats, that the change of another parameter at the same time must add; part of its information that those
+# before must leave; and least variance of a change.
+_MORE, _LEFT, _LEAST = 10.0, 1e-3, 1e-300
 
 
 @dataclass(frozen=True)
@@ -46,12 +49,15 @@ class ChangeTests:
         Inverse variance; 0 where the window does not determine a change.
     shift : (2, A, n, n) array
         Change of all parameters before it, per unit of its size.
+    of_steps : (A, n, n) array
+        Information of steps of all parameters at once.
     """
 
     ages: IntArray
     size: FloatArray
     information: FloatArray
     shift: FloatArray
+    of_steps: FloatArray
 
     @property
     def ratio(self) -> FloatArray:
@@ -73,9 +79,54 @@ class ChangeTests:
         (2, A, n) array
         """
         information = self.information / scatter
-        prior = np.square(_USUAL_CHANGE * values) * information
-        ratio = np.square(self.size) * information
-        return np.asarray(0.5 * ratio * prior / (1.0 + prior) - 0.5 * np.log1p(prior))
+        return _gain(self.size * information, information, np.square(_USUAL_CHANGE * values))
+
+    def steps_at_once(self, values: FloatArray, scatter: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Steps of several parameters at the same time: one after the other is added as long as the evidence grows.
+
+        Parameters
+        ----------
+        values : (n,) array
+            Parameters.
+        scatter : (A, n) array
+            Variance of the ratios where nothing changes.
+
+        Returns
+        -------
+        (A,) array
+            Logarithm of the Bayes factor.
+        (A, n) bool array
+            Parameters that change.
+        """
+        ages, prior = np.arange(len(self.ages)), np.square(_USUAL_CHANGE * values)
+        std = np.sqrt(scatter)
+        M, score = self.of_steps / (std[:, :, None] * std[:, None, :]), self.size[0] * self.information[0] / scatter
+        own, total, chosen = self.information[0] / scatter, np.zeros(len(ages)), np.zeros(score.shape, bool)
+        for k in range(len(values)):
+            left = np.maximum(np.einsum("ajj->aj", M), 0.0)
+            more = np.where(left > _LEFT * own, _gain(score, left, prior), -np.inf)
+            j = np.argmax(more, axis=1)
+            grows = more[ages, j] > (_MORE if k else 0.0)
+            if not grows.any():
+                break
+            column = M[ages, :, j] * grows[:, None]
+            pivot = left[ages, j] + 1.0 / np.maximum(prior[j], _LEAST)
+            total += np.where(grows, more[ages, j], 0.0)
+            chosen[ages[grows], j[grows]] = True
+            score = score - column * (score[ages, j] / pivot)[:, None]
+            M = M - column[:, :, None] * column[:, None, :] / pivot[:, None, None]
+        return total, chosen
+
+    def sizes(self, age: int, chosen: BoolArray) -> FloatArray:
+        """Sizes ``(m,)`` of steps of some parameters ``(n,)`` at once, at the age of a place."""
+        score = (self.size[0, age] * self.information[0, age])[chosen]
+        return np.asarray(np.linalg.lstsq(self.of_steps[age][np.ix_(chosen, chosen)], score)[0])
+
+
+def _gain(score: FloatArray, information: FloatArray, prior: FloatArray) -> FloatArray:
+    """Logarithms of the Bayes factors of changes with a Gaussian prior of some variance."""
+    known = prior * information
+    return np.asarray(0.5 * prior * np.square(score) / (1.0 + known) - 0.5 * np.log1p(known))
 
 
 def ages_of(n: int) -> IntArray:
@@ -93,7 +144,7 @@ def ages_of(n: int) -> IntArray:
 
 
 def fine_ages_of(n: int) -> IntArray:
-    """Ages of changes that are compared in a window of n intervals: all of the last ones, and ever fewer before.
+    """Ages of changes that are compared in a window of n intervals: all from the second one on, and ever fewer before.
 
     Parameters
     ----------
@@ -103,9 +154,8 @@ def fine_ages_of(n: int) -> IntArray:
     -------
     (A,) int array
     """
-    return np.unique(np.minimum(np.round(1.2 ** np.arange(1, 1 + np.ceil(np.log(n) / np.log(1.2)))), n)).astype(
-        np.int64
-    )
+    powers = _FINELY ** np.arange(3, 1 + np.ceil(np.log(n) / np.log(_FINELY)))
+    return np.unique(np.minimum(np.round([*powers, n]), n)).astype(np.int64)
 
 
 def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:
@@ -122,7 +172,7 @@ def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:
     ChangeTests
     """
     at, fit = found.at, found.fit
-    W, n_x, k = len(fit.x), fit.x.shape[1], at.right_z.shape[1]
+    A, W, n_x, k = len(ages), len(fit.x), fit.x.shape[1], at.right_z.shape[1]
     weight = _weights(ages, W)
     own, onward = at.system.border.copy(), -at.precision[:, :, None] * at.slopes[:, :, k:]
     own[1:, :n_x] -= onward
@@ -137,12 +187,16 @@ def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:
     z, s = at.system.functional(of_z.reshape(W, k, -1), of_s.reshape(n, -1))
     z, s = z.reshape(of_z.shape), s.reshape(of_s.shape)
     information = direct - np.einsum("wkcj,wkcj->cj", of_z, z) - np.einsum("icj,icj->cj", of_s, s)
+    of_steps = np.einsum("cw,wjl->cjl", np.square(c[:A]), at.corners) - np.einsum("icj,icl->cjl", of_s[:, :A], s[:, :A])
+    of_steps -= np.einsum("wkcj,wkcl->cjl", of_z[:, :, :A], z[:, :, :A], optimize=True)
     score += np.einsum("wk,wkcj->cj", at.right_z, z) + np.einsum("i,icj->cj", at.right_s, s)
     information = np.where(information > _DETERMINED * direct, information, 0.0)
     size = np.divide(-score, information, out=np.zeros_like(score), where=information > 0.0)
-    shape = (2, len(ages), n)
+    shape = (2, A, n)
+    known = (information[:A] > 0.0).astype(float)
+    of_steps *= known[:, :, None] * known[:, None, :]
     shift = -np.moveaxis(s, 0, -1)
-    return ChangeTests(ages, size.reshape(shape), information.reshape(shape), shift.reshape(*shape, n))
+    return ChangeTests(ages, size.reshape(shape), information.reshape(shape), shift.reshape(*shape, n), of_steps)
 
 
 def _weights(ages: IntArray, W: int) -> FloatArray:

@@ -369,4 +369,5 @@ def _started(setup: Setup, start: Mapping[str, float] | Result) -> tuple[Setup, 
         )
     resolution = start.estimate.resolution
     known, covariance = np.array(list(start.parameters.values()))[free], start.covariance[np.ix_(free, free)]
-    return replace(setup, timing=resolution.timing), Start(known, covariance, (resolution.hold,))
+    exact = start.estimate.competition is None
+    return replace(setup, timing=resolution.timing, exact=exact), Start(known, covariance, (resolution.hold,))

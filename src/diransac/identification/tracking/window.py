@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import bounded, gauss_newton_step, linearized
@@ -209,34 +209,36 @@ class Window:
             root[changing, np.arange(len(changing))] = std[changing]
             self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
 
-    def release(self, first: int, index: int, before: FloatArray, change: float) -> tuple[float, float]:
-        """Begin the window anew where a parameter has changed, of which nothing is known from then on.
+    def release(
+        self, first: int, changed: IntArray, before: FloatArray, sizes: FloatArray
+    ) -> list[tuple[float, float]]:
+        """Begin the window anew where parameters have changed, of which nothing is known from then on.
 
         Parameters
         ----------
         first : int
             Interval with which the change begins.
-        index : int
-            Of the parameter.
+        changed : (m,) int array
+            Parameters that change.
         before : (n_p,) array
             Parameters before the change.
-        change : float
-            Its size.
+        sizes : (m,) array
+            Of the changes.
 
         Returns
         -------
-        float, float
-            The parameter before the change, and its standard error.
+        list of (float, float)
+            Each of these parameters before the change, and its standard error.
         """
         whole = self.fit
-        fit, value, error = self._fit_before(first, index, before)
+        fit, known = self._fit_before(first, changed, before)
         shared, rows = fit.shared.copy(), first * self.length
-        shared[index] += change
+        shared[changed] += sizes
         shared = bounded(self.intervals(), fit.shared, shared)
         assert fit.boundary is not None
         # The change may be within the interval before or after, whose motion is then that of neither.
         free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
-        free[len(free) - len(shared) + index] = _FREE * max(abs(shared[index]), abs(change))
+        free[len(free) - len(shared) + changed] = _FREE * np.maximum(np.abs(shared[changed]), np.abs(sizes))
         boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
         # Outliers and forces for which the change was taken until it was found are forgotten.
@@ -244,17 +246,17 @@ class Window:
         self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
         self.fit = with_residuals(self.intervals(), self.fit)
         self.optimise()
-        return value, error
+        return known
 
-    def _fit_before(self, first: int, index: int, before: FloatArray) -> tuple[Fit, float, float]:
-        """The fit of the intervals before one of the window, as a boundary of that, with a parameter and its error."""
+    def _fit_before(self, first: int, changed: IntArray, before: FloatArray) -> tuple[Fit, list[tuple[float, float]]]:
+        """The fit of the intervals before one of the window, as a boundary of that; parameters and their errors."""
         if not first:
             boundary = self.fit.boundary
             assert boundary is not None
-            mean, variance = boundary.marginal_of(len(boundary.point) - len(before) + index)
+            found = [boundary.marginal_of(len(boundary.point) - len(before) + int(k)) for k in changed]
             shared = before.copy()
-            shared[index] = mean
-            return replace(self.fit, shared=shared), mean, float(np.sqrt(variance))
+            shared[changed] = [mean for mean, _ in found]
+            return replace(self.fit, shared=shared), [(mean, float(np.sqrt(variance))) for mean, variance in found]
         whole = self.intervals()
         is_before = np.arange(len(whole.measured)) < first * self.length
         intervals = replace(whole, sampled=whole.sampled & is_before[:, None])
@@ -264,8 +266,8 @@ class Window:
             taken = gauss_newton_step(intervals, fit, at, damping)
             fit, damping = taken.fit, taken.damping
         boundary = marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
-        error = float(np.sqrt(taken.solved.var_p[index, index]))
-        return replace(fit, boundary=boundary), float(fit.shared[index]), error
+        errors = np.sqrt(np.diag(taken.solved.var_p))
+        return replace(fit, boundary=boundary), [(float(fit.shared[k]), float(errors[k])) for k in changed]
 
     # ------------------------------------------------------------------ the fit
 
@@ -311,7 +313,7 @@ class Window:
         seen = intervals.known.any(axis=0)
         noise = self.fit.noise
         nothing = ((noise.sigma > _ALL_OF_IT * self._spread) | (noise.pi > _ALL_OF_IT))[seen].all()
-        return bool(nothing or (self.fit.tau > self.spread).any())
+        return bool(nothing or (self.fit.tau > self.spread).all())
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""
