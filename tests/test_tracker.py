@@ -269,6 +269,18 @@ def test_bad_argument_is_refused_in_one_sentence(options, message):
         dr.Tracker(MODEL, **options)
 
 
+def test_log_without_any_estimate_says_why():
+    log = flown(700, 3)
+    still = dr.Log.from_arrays(log.time[:300], {name: log[name][:300] for name in log.names})
+    with pytest.raises(LogError, match="no estimate: there are fewer than 5 s of rows; give rough values as start"):
+        list(dr.track(MODEL, still))
+    with pytest.raises(LogError, match=r"no estimate: .*too few"):
+        list(dr.track(MODEL, still.between(0.0, 0.5), start=ROUGH))
+    tracker = dr.Tracker(MODEL, start=ROUGH)
+    tracker.update(columns_of(still))
+    assert not tracker.missing
+
+
 @pytest.mark.parametrize(
     ("samples", "message"),
     [

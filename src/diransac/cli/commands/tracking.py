@@ -31,7 +31,7 @@ from diransac.cli.tracking import Summary, TrackTable, as_line, followed, to_dic
 from diransac.errors import LogError
 from diransac.identification.result import Result
 from diransac.identification.structure.known_parameters import KnownParameters
-from diransac.identification.tracking import TrackedEstimate, Tracker, track
+from diransac.identification.tracking import TrackedEstimate, Tracker, refused_if_none, track
 from diransac.identification.tracking.history import History
 from diransac.model import Model
 
@@ -160,7 +160,7 @@ def _following(
     """Estimates of a file that grows; a cold start is waited for, so that no answer depends on the time it takes."""
     tracker, step = Tracker(model, background=False, **arguments), arguments["step"]
     parts = followed(reader, model, idle=idle, pause=0.5 * step, clock=time.monotonic, sleep=time.sleep)
-    for now in tracked(tracker, parts, step):
+    for now in refused_if_none(tracker, tracked(tracker, parts, step)):
         for note in reader.taken_notes():
             findings.append(note)
             screen.note(note)
@@ -188,7 +188,7 @@ class _Shown:
 def _finish(history: History, picture: Path | None, page: Path | None) -> None:
     """Write the figure and the page.  Raises LogError: there is no estimate."""
     if history.last is None:
-        raise LogError("there is no estimate: the log has too few samples; a tracker needs a second of them at least")
+        raise LogError("there is no estimate as yet: a tracker needs a second of samples at least")
     if picture is not None:
         from diransac.plots.tracking import plot_tracking
 

@@ -15,6 +15,6 @@
 """
 
 from diransac.identification.tracking.estimates import Change, TrackedEstimate
-from diransac.identification.tracking.tracker import Tracker, track
+from diransac.identification.tracking.tracker import Tracker, refused_if_none, track
 
-__all__ = ["Change", "TrackedEstimate", "Tracker", "track"]
+__all__ = ["Change", "TrackedEstimate", "Tracker", "refused_if_none", "track"]

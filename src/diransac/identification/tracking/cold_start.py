@@ -42,12 +42,18 @@ class ColdStart:
         Time from which on the first rows are identified, s.
     background : bool
         Whether `sought` returns while an identification runs.
+
+    Attributes
+    ----------
+    refused : str
+        Why there is no start yet.
     """
 
     def __init__(self, setup: Setup, seed: int, window: float, *, background: bool) -> None:
         self.setup, self.seed, self.window, self.background = setup, seed, window, background
         self._running: Future[Result] | None = None
         self._needed, self._not_before = window, 0
+        self.refused = f"there are fewer than {window:g} s of rows"
 
     def restart(self) -> None:
         """Begin again with the rows of one window."""
@@ -70,9 +76,12 @@ class ColdStart:
         if self._running is None or (self.background and not self._running.done()):
             return None
         running, self._running = self._running, None
+        seconds = f"an identification of {self._needed:.3g} s"
         try:
-            result: Result | None = running.result()
-        except DiransacError:
+            result = running.result()
+            self.refused = f'{seconds} says "{result.verdict}"'
+        except DiransacError as error:
+            self.refused = f"{seconds} fails: {error}"
             result = None
         if result is None or result.verdict == "do not rely on this":
             self._needed = min(2.0 * self._needed, len(stream.values) * stream.dt - self.window)

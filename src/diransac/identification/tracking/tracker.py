@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
     from diransac.identification.tracking.window import Window
 
-__all__ = ["Tracker", "track"]
+__all__ = ["Tracker", "refused_if_none", "track"]
 
 Samples = Log | Mapping[str, npt.ArrayLike]
 
@@ -109,7 +109,7 @@ class Tracker:
         self._sensors = SensorWatch(self._setup)
         self._window: Window | None = None
         self._notes: list[str] = []
-        self._retry = 0
+        self._retry, self._refused = 0, ""
 
     def update(self, samples: Samples) -> TrackedEstimate | None:
         """Take samples.
@@ -135,6 +135,13 @@ class Tracker:
             return None
         changes = tuple(x for one in found for x in one.changes)
         return replace(found[-1], changes=changes, notes=tuple(x for one in found for x in one.notes))
+
+    @property
+    def missing(self) -> str:
+        """Why there is no estimate; empty while there is one."""
+        if self._window is not None:
+            return ""
+        return self._cold.refused if self._start is None else self._refused or "there are too few rows"
 
     # ------------------------------------------------------------------ samples
 
@@ -193,8 +200,8 @@ class Tracker:
         try:
             window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
             window.optimise()
-        except DiransacError:  # too few samples as yet
-            self._retry = end + stream.length
+        except DiransacError as error:  # too few samples as yet
+            self._retry, self._refused = end + stream.length, str(error)
         except np.linalg.LinAlgError:
             self._begin_anew()
         else:
@@ -293,7 +300,7 @@ def track(
     SettingsError
         As `Tracker`.
     LogError
-        As `Tracker.update`.
+        As `Tracker.update`; or the log ends without any estimate.
     """
     if not isinstance(log, Log):
         raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
@@ -308,7 +315,27 @@ def track(
         drift=drift,
         background=False,
     )
-    return tracker._estimates(*tracker._columns(log))
+    return refused_if_none(tracker, tracker._estimates(*tracker._columns(log)))
+
+
+def refused_if_none(tracker: Tracker, estimates: Iterator[TrackedEstimate]) -> Iterator[TrackedEstimate]:
+    """Estimates of a tracker as they come.
+
+    Parameters
+    ----------
+    tracker : Tracker
+    estimates : iterator of TrackedEstimate
+
+    Raises
+    ------
+    LogError
+        They end without any.
+    """
+    first = next(estimates, None)
+    if first is None:
+        raise LogError(f"there is no estimate: {tracker.missing}; give rough values as start")
+    yield first
+    yield from estimates
 
 
 # ---------------------------------------------------------------------- arguments
