@@ -8,6 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.errors import LogError, SettingsError
+from diransac.identification.tracking.starting import smoothed_motion
 from simulated import ROTORCRAFT, VEHICLE, as_log, flight, rotorcraft_acceleration, with_outliers
 
 DT = 0.01
@@ -198,6 +199,20 @@ def test_gap_and_restart_of_the_clock_are_said_and_change_nothing():
     assert [x for now in restarted for x in now.notes] == ["the clock restarts at t = 0 s, after t = 4.99 s"]
     assert np.abs(ratios(restarted[-1])).max() < 4.0
     assert restarted[-1].time == pytest.approx(3.99, abs=0.1)
+
+
+def test_gap_waits_for_as_many_samples_as_the_smoother_needs(monkeypatch):
+    def demanding(setup, stream, first, n_rows):
+        if n_rows < 150:
+            raise LogError(f"{n_rows} rows are too few")
+        return smoothed_motion(setup, stream, first, n_rows)
+
+    monkeypatch.setattr("diransac.identification.tracking.tracker.smoothed_motion", demanding)
+    columns = columns_of(flown(900, 3))
+    kept = (columns["t"] < 6.0) | (columns["t"] >= 6.5)
+    found = fed({name: x[kept] for name, x in columns.items()})
+    assert found[-1].time == pytest.approx(8.99)
+    assert np.abs(ratios(found[-1])).max() < 3.5
 
 
 def test_single_wrong_stamp_is_left_out():

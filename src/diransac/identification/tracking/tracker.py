@@ -220,14 +220,18 @@ class Tracker:
         n = self._joining(end) if new else parts
         if n is None or end < window.end + n * window.length:
             return False
+        try:
+            states = self._states(window, n) if new else None
+        except DiransacError:  # too few samples as yet
+            return False
         excess = len(window) + n - window.most
         if excess > 0:
             window.leave(min(excess, len(window) - 1))
             stream.drop(window.first // stream.length * stream.length - stream.first)
         self._changes.before_step(window)
         try:
-            if new:
-                window.join(self._states(window, n))
+            if states is not None:
+                window.join(states)
             else:
                 window.extend(n)
             self._changes.after_step(window, window.optimise())
