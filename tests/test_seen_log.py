@@ -43,11 +43,10 @@ def test_options_of_earlier_versions_change_nothing(folder, options):
 
 @pytest.mark.slow
 def test_pairs_of_faulty_logs_are_usable(folder):
-    """Of twenty pairs with 2 to 10 % outliers, gaps and jitter, all but one at most are usable on both logs."""
-    usable = 0
-    for seed in range(20):
+    """The first eight pairs of `benchmarks/faulty_pairs.py`, with 2 to 10 % outliers, gaps and jitter."""
+    for seed in range(8):
         write_pair(folder, seed)
         run("identify", "log.csv", "--model", "model.py", "-o", "result.json")
-        validations = (run("validate", "result.json", log, "--json").stdout for log in ("log.csv", "other.csv"))
-        usable += all(json.loads(text)["verdict"] == "usable" for text in validations)
-    assert usable >= 19
+        for log in ("log.csv", "other.csv"):
+            validated = json.loads(run("validate", "result.json", log, "--json").stdout)
+            assert validated["verdict"] == "usable", (seed, log)
