@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Changes"]
 
 # Time over which the scatter of the tests is remembered, and for which tests as they should be count beside it, s.
-_MEMORY, _AS_EXPECTED = 60.0, 10.0
+_MEMORY, _AS_EXPECTED = 60.0, 20.0
 # Windows from whose tests their scatter is known, where the model has not been exact.
 _LEARNED = 3.0
 # Standard errors within which a parameter has returned to an earlier value.
@@ -165,11 +165,10 @@ class Changes:
         per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
         return float(np.log(per_hour / self.false_alarms))
 
-    def _scatter(self, ages: IntArray, n: int, as_expected: float = _AS_EXPECTED) -> FloatArray:
+    def _scatter(self, ages: IntArray, n: int) -> FloatArray:
         """Variance ``(2, A, n_p)`` of the ratios of tests of some ages in n intervals, as remembered; 1 at least."""
         places = self._places(ages, n)
-        expected = as_expected / (ages[:, None] * self.step)
-        found = (self._squares[:, places] + expected) / (self._counts[:, places] + expected)
+        found = (self._squares[:, places] + _AS_EXPECTED) / (self._counts[:, places] + _AS_EXPECTED)
         return np.asarray(np.maximum(found, 1.0))
 
     def _places(self, ages: IntArray, n: int) -> IntArray:
@@ -277,7 +276,7 @@ class Changes:
         assert window.last is not None
         drift = np.diag(self.drift.rate * self._duration(window) / 3.0)
         n = len(window)
-        more = np.sqrt(self._scatter(np.array([n]), n, _MEMORY)[0, -1])
+        more = np.sqrt(self._scatter(np.array([n]), n)[0, -1])
         return np.asarray((window.last.solved.var_p + drift) * np.outer(more, more))
 
     def taken(self) -> tuple[Change, ...]:
