@@ -40,6 +40,8 @@ _INTERVAL = 1.96
 _CHANGE: dict[str, Any] = {"color": COLOURS[2], "linewidth": 1.0, "linestyle": (0.0, DASHES[2])}
 # Part of the values that may be outside of a panel, as those of the first seconds are, and the free part beyond.
 _TAIL, _MARGIN = 0.02, 0.15
+# Room for the legend of outliers, over their range.
+_LEGEND = 0.5
 
 
 def plot_tracking(history: History, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -117,6 +119,6 @@ def _draw_outliers(axes: Axes, history: History, shown: slice) -> None:
         dashes = DASHES[k // len(COLOURS) % len(DASHES)]
         style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": (0.0, dashes) if dashes else "-"}
         axes.plot(history.time[shown], history.outliers(name)[shown], linewidth=0.9, label=name, **style)
-    axes.set_ylim(0.0, None)
+    axes.set_ylim(0.0, (1.0 + _LEGEND) * axes.get_ylim()[1])
     axes.set_xlim(*axes.figure.axes[0].get_xlim())
-    axes.legend(fontsize=6.5, ncols=8, frameon=False, loc="upper left", labelcolor=INK)
+    axes.legend(fontsize=6.5, ncols=5, frameon=False, loc="upper left", labelcolor=INK)

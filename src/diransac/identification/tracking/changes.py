@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Changes"]
 
-# Time over which the scatter of the tests is remembered, and for which tests as they should be count beside it, s.
+# Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
 _MEMORY, _AS_EXPECTED = 60.0, 20.0
 # Windows from whose tests their scatter is known, where the model has not been exact.
 _LEARNED = 3.0
