@@ -263,7 +263,16 @@ def _hours_table(rows: Sequence[Row]) -> str:
     own = [row for row in rows if "grown" in row]
     if not own:
         return ""
-    header = ["", "hours", "false", "coverage", "rate, /s", "latency, ms", "slowest, ms", "memory grown, MiB"]
+    header = [
+        "",
+        "hours",
+        "false",
+        "coverage",
+        "rate, /s",
+        "latency, ms",
+        "slowest, ms",
+        "memory grown by all estimates, which are kept, MiB",
+    ]
     lines = ["## Hours without a change: planar, 10 % outliers", "", _line(header), _line(["---"] * len(header))]
     for scenario in dict.fromkeys(row["scenario"] for row in own):
         group = [row for row in own if row["scenario"] == scenario]

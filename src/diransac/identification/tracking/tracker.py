@@ -138,7 +138,7 @@ class Tracker:
 
     @property
     def missing(self) -> str:
-        """Why there is no estimate; empty while there is one."""
+        """Reason for which there is no estimate; empty while there is one."""
         if self._window is not None:
             return ""
         return self._cold.refused if self._start is None else self._refused or "there are too few rows"
