@@ -27,8 +27,8 @@ from scipy.signal import medfilt, savgol_filter
 LENGTH, LONGEST_DELAY, CAP = 0.2, 0.02, 1e3
 """Windows, s; longest delay, s; largest error in standard deviations, for rollouts that diverge."""
 DELAY = "delay"
-STARTS, STAGES = 8, ((100.0, 1e-2), (10.0, 1e-3), (3.0, 1e-4))
-"""Starts on small machines; scale of the loss in standard deviations and relative step of differences, by stage."""
+STARTS, ITERATIONS, STAGES = 8, 40, ((100.0, 0.1), (100.0, 1e-2), (10.0, 1e-3), (3.0, 1e-4))
+"""Starts on small machines; iterations of `mujoco.sysid`; scale of the loss in standard deviations and relative step of differences, by stage."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def output_error(case: Case) -> dict[str, float]:
     """Multiple shooting: SciPy's ``least_squares`` over windows from filtered first states, from the nominal values.
 
     Rollouts jump where contacts begin a step earlier, on which a plain fit stalls: steps of differences and scale of
-    the soft-L1 loss shrink in three stages.  Small machines have further starts within a factor of three.
+    the soft-L1 loss shrink in stages.  Small machines have further starts within a factor of three.
     """
     windows, size, rng = Windows(case), sizes(case), np.random.default_rng(0)
     names, scale = list(size), np.array(list(size.values()))
@@ -222,12 +222,12 @@ def sysid(case: Case, **settings: Any) -> dict[str, float]:
         case.name, driven(case.xml, case.actuation), [f"w{k}" for k in range(len(records))], origins, controls, records,
         allow_missing_sensors=True,
     )  # fmt: skip
-    settings = settings or {"eps": 1e-4}
+    settings = {"max_iters": ITERATIONS} | (settings or {"eps": 1e-4})
     with redirect_stdout(StringIO()):  # its solver prints every iteration
         found, _ = optimize(
             initial_params=unknown,
             residual_fn=build_residual_fn(models_sequences=[sequences], modify_residual=residual),
-            verbose=False, max_iters=20, **settings,
+            verbose=False, **settings,
         )  # fmt: skip
     return dict(zip(names, (np.asarray(found.as_vector()) * scale).tolist(), strict=True))
 

@@ -149,7 +149,7 @@ def pushed_box(seed: int, *, outliers: float = 0.05, gaps: bool = True, seconds:
         def force(j: int, data: Any) -> Array:
             phase, gap = j * DT / period % 1.0, data.qpos[0] - 0.09
             target = gap + (stroke * np.interp(phase, [0.0, 0.3, 0.5, 0.6, 1.0], [-0.5, 0.3, 0.4, -0.5, -0.5]))
-            return np.clip([stiffness * (target - data.qpos[7]) - 20.0 * data.qvel[6]], -30.0, 30.0)
+            return np.clip([stiffness * (target - data.qpos[7]) - 60.0 * data.qvel[6]], -30.0, 30.0)
 
         return force
 
