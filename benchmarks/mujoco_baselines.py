@@ -28,7 +28,7 @@ LENGTH, LONGEST_DELAY, CAP = 0.2, 0.02, 1e3
 """Windows, s; longest delay, s; largest error in standard deviations, for rollouts that diverge."""
 DELAY = "delay"
 STARTS, ITERATIONS, STAGES = 8, 40, ((100.0, 0.1), (100.0, 1e-2), (10.0, 1e-3), (3.0, 1e-4))
-"""Starts on small machines; iterations of `mujoco.sysid`; scale of the loss in standard deviations and relative step of differences, by stage."""
+"""Starts on small machines; iterations of `mujoco.sysid`; by stage, scale of the loss (deviations) and step."""
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,8 @@ def drawn(
 ) -> tuple[dict[str, float], ...]:
     """True values, uniform in their ranges, and nominal ones, which are those of the file; of each match of a mask."""
     spec = mujoco.MjSpec.from_string(xml)
-    truth, nominal = {}, {}
+    truth: dict[str, float] = {}
+    nominal: dict[str, float] = {}
     for mask, (low, high) in ranges.items():
         if is_bias(mask):
             names = {f"{mask}[{k}]": 0.0 for k in range(3)}
