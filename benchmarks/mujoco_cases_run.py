@@ -95,9 +95,10 @@ METHODS: Mapping[str, Callable[[Case, int], Row]] = {
     "default": default,
     "robot": robot,
     "output error": lambda case, seed: {"parameters": output_error(case)},
-    "mujoco.sysid": lambda case, seed: {"parameters": sysid(case)},
+    "mujoco.sysid": lambda case, seed: {"parameters": sysid(case), "truth": dict(case.truth)},
     "sysid soft-L1": lambda case, seed: {
-        "parameters": sysid(case, optimizer="scipy_parallel_fd", loss="soft_l1", f_scale=3.0, diff_step=1e-4)
+        "parameters": sysid(case, optimizer="scipy_parallel_fd", loss="soft_l1", f_scale=3.0, diff_step=1e-4),
+        "truth": dict(case.truth),
     },
 }
 
@@ -181,9 +182,12 @@ def by_parameter(rows: Sequence[Row]) -> list[str]:
     groups = {method: group for (_, method), group in grouped(rows).items()}
     lines = [f"| {rows[0]['case']}: error in tolerances, median (worst) | tolerance | {' | '.join(groups)} |"]
     lines += ["|---|--:|" + "--:|" * len(groups)]
-    for name, truth in rows[0]["truth"].items():
+    for name, truth in {name: x for row in rows for name, x in row["truth"].items()}.items():
         cells = []
         for group in groups.values():
+            if name not in group[0]["truth"]:  # given to the method
+                cells.append("")
+                continue
             errors = [error_of(row, name) for row in group]
             inside = [x for row in group for x in covered(row, "intervals", [name])]
             share = f", {sum(inside)}/{len(inside)} cover" if inside else ""
