@@ -14,6 +14,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.log import Log
 from diransac.data.segment import Segment, bind_log, bulk_range
 from diransac.errors import LogError, SettingsError
+from diransac.model.parameter import parameter_of
 
 if TYPE_CHECKING:
     from diransac.model import Model, Parameter
@@ -39,6 +40,8 @@ class ParameterLayout:
     ----------
     names : tuple of str
         The n names: the model's; ``bias[0]``, ``bias[1]``, ... for a per-log parameter of several logs.
+    owners : tuple of str
+        The parameter of the model that each of the n is a value of.
     bounds : tuple of Parameter
         Unit and bounds of each of the n.
     index : (n_logs, n_p) int array
@@ -61,9 +64,10 @@ class ParameterLayout:
             columns.append([len(names) + (i if len(own) > 1 else 0) for i in range(n_logs)])
             names += own
         self.names = tuple(names)
-        self.bounds = tuple(self.parameters[name.partition("[")[0]] for name in names)
+        self.owners = tuple(parameter_of(name, self.parameters) for name in names)
+        self.bounds = tuple(self.parameters[name] for name in self.owners)
         self.index: IntArray = np.array(columns, np.int64).reshape(len(columns), n_logs).T
-        beforehand = np.array([self.priors.get(name.partition("[")[0], (0.0, np.inf)) for name in names])
+        beforehand = np.array([self.priors.get(name, (0.0, np.inf)) for name in self.owners])
         self.prior_mean, self.prior_std = beforehand.T
 
     def __len__(self) -> int:

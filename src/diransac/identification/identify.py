@@ -27,6 +27,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.lacking_terms import with_terms
 from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
+from diransac.model.mjcf import MujocoModel
 from diransac.process import single_threaded
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
@@ -207,7 +208,7 @@ def checked_hold(name: object) -> str | None:
 
 
 def _check_arguments(model: object, seed: object) -> None:
-    if not isinstance(model, Model):
+    if not isinstance(model, Model | MujocoModel):
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise SettingsError(f"seed is {seed!r}; give a whole number")
@@ -376,7 +377,9 @@ class _Task:
 
 
 def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
-    """Mistakes of columns that explain the logs, and the number of those tested."""
+    """Mistakes of columns that explain the logs, and the number of those tested; none without equations."""
+    if not dataset.model.has_equations:
+        return [], 0
     from diransac.identification.regression.nonlinear import solved_nonlinear
 
     with np.errstate(all="ignore"):  # a correction that overflows explains nothing
@@ -401,6 +404,8 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
 
     An answer is doubtful, too, where much is unexplained, or a parameter that must not be zero may be if a term lacks.
     """
+    if not dataset.model.has_equations:
+        return result
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
     is_bad, n_tested = result.verdict == "do not rely on this", 0
     parameters = result.model.parameters

@@ -127,11 +127,11 @@ def _cause_of_failure(dataset: Dataset) -> str:
     Rows without velocities or accelerations excite nothing, whatever the motion: the method estimates what they lack.
     """
     model = dataset.model
-    found = structural(model, ranges=dataset.ranges)
+    found = structural(model, ranges=dataset.ranges) if model.has_equations else ()
     if found:
         return "; ".join(x.sentence(x.of_equations()) for x in found)
     needed = {*model.state, *model.accelerations}
-    if not all(needed <= set(one.present) for one in dataset.segments):
+    if not (model.has_equations and all(needed <= set(one.present) for one in dataset.segments)):
         return "the fit diverges; check the model's constants and units, bound the parameters, or try another method"
     try:
         return cause_of_refusal(model, dataset.layout, motion_rows(dataset))

@@ -30,6 +30,7 @@ from diransac.identification.structure.lacking_terms import (
     mixture_intervals,
 )
 from diransac.model import Model
+from diransac.model.parameter import parameter_of
 from diransac.plain_data import json_data, read_text
 
 if TYPE_CHECKING:
@@ -338,8 +339,9 @@ class Result:
     @property
     def on_bounds(self) -> tuple[str, ...]:
         """Names of the parameters on one of their bounds, where the estimator stopped: their intervals are unknown."""
-        stuck = zip(self.layout.names, self.layout.on_bounds(self.estimate.values), strict=True)
-        return tuple(n for n, on_bound in stuck if on_bound and n.partition("[")[0] not in self.fixed)
+        layout = self.layout
+        stuck = zip(layout.names, layout.owners, layout.on_bounds(self.estimate.values), strict=True)
+        return tuple(n for n, owner, on_bound in stuck if on_bound and owner not in self.fixed)
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -360,7 +362,7 @@ class Result:
     def unidentifiable(self) -> tuple[str, ...]:
         """Parameters that the logs do not determine, as lo-diransac finds; a per-log one if it is so in any log."""
         found = () if self.diagnosis is None else self.diagnosis.unidentifiable
-        return tuple(dict.fromkeys(name.partition("[")[0] for name in found))
+        return tuple(dict.fromkeys(parameter_of(name, self.model.parameters) for name in found))
 
     @property
     def degrees_of_freedom(self) -> int:

@@ -122,8 +122,10 @@ def check_groups(label: str, units: Mapping[str, object], parameters: object) ->
             raise ModelError(f'{label}: parameter {name!r} is {parameter!r}; give dr.Parameter("kg") or the like')
 
 
-def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
+def check_names(label: str, groups: Sequence[Mapping[str, object]], *, masks: bool = False) -> None:
     """Check names of coordinates, velocities, states of first order, derivatives, inputs, parameters and sensors.
+
+    Parameters that equations do not name may be masks.
 
     Raises ModelError: a name is not an identifier or is used twice, or there are no states or parameters.
     """
@@ -132,7 +134,9 @@ def check_names(label: str, groups: Sequence[Mapping[str, object]]) -> None:
         raise ModelError(f"{label}: there are {beyond(MOST_NAMES, 'names', len(names))}")
     known = set[object]()
     for name in names:
-        if str(name) != name or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("__"):
+        free = masks and name in groups[-2]
+        is_symbol = str(name) == name and name.isidentifier() and not keyword.iskeyword(name)
+        if not free and (not is_symbol or name.startswith("__")):
             raise ModelError(
                 f"{label}: {name!r} cannot name a signal or parameter; use letters, digits and underscores"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,19 @@ import numpy.typing as npt
 from diransac.errors import ModelError
 from diransac.plain_text import is_one_line
 
-__all__ = ["Parameter"]
+__all__ = ["Parameter", "parameter_of"]
+
+
+def parameter_of(name: str, parameters: Collection[str]) -> str:
+    """Parameter of a model that a value is of: ``bias`` of ``bias[0]``, its value in the first of several logs.
+
+    Parameters
+    ----------
+    name : str
+    parameters : collection of str
+        Names of the model's parameters.
+    """
+    return name if name in parameters else name.rpartition("[")[0]
 
 
 @dataclass(frozen=True)

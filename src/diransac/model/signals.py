@@ -23,6 +23,8 @@ class Signals:
     A model without ``kinematics`` has the derivatives of its coordinates as velocities, ``x_dot`` of ``x``.
     """
 
+    has_equations = True
+    """Whether the residuals are known as expressions; otherwise a simulator alone knows the machine."""
     kinematics: ca.Function | None
 
     def _name_signals(
@@ -50,7 +52,7 @@ class Signals:
             accelerations = {f"{v}_dot": _per_second(unit) for v, unit in velocities.items()}
         rates = {f"{s}_dot": _per_second(unit) for s, unit in first_order.items()}
         groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters, sensors)
-        derivation.check_names(self._label, groups)
+        derivation.check_names(self._label, groups, masks=not self.has_equations)
         self.velocities, self.accelerations = {**of_motion, **self.first_order}, {**accelerations, **rates}
 
     @property

@@ -318,11 +318,15 @@ class LinearizedErrors:
         Simulated less measured, each signal's unit.
     jacobian : (n_lanes, n_rows, n_s, n_z)
         Derivatives of the errors.
+    final_states, final_slopes : (n_lanes, n_x) and (n_lanes, n_x, n_z), optional
+        State one row after the last, and its derivatives, by a back end that has them without further simulations.
     """
 
     unknowns: tuple[str, ...]
     errors: FloatArray
     jacobian: FloatArray
+    final_states: FloatArray | None = None
+    final_slopes: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
+from diransac.model.mjcf.model import MujocoModel
 from diransac.simulation.batch import (
     ClosedLoopBatch,
     GaussNewtonBatch,
@@ -70,14 +71,14 @@ def rollouts(
     substeps: int = 1,
     hold: str = "zero-order",
     target: Target | None = None,
-) -> Rollouts:
-    """Compiled rollouts of a model; the same object again for an equal model and equal options.
+) -> Simulator:
+    """Rollouts of a model, compiled or by MuJoCo; the same object again for an equal model and equal options.
 
     Parameters
     ----------
-    model : Model or DisturbedModel
+    model : Model, DisturbedModel or MujocoModel
         The model to simulate, or `Plant.simulated`: its `dynamics` are an SX function (x, u, p) -> (dx/dt,
-        accelerations).
+        accelerations).  MuJoCo has an integrator and steps of its own.
     signals : sequence of str, optional
         Signals that are compared with measurements, in the order of their columns; all by default.
     integrator : {"rk4", "euler", "semi-implicit-euler"}
@@ -110,11 +111,21 @@ def rollouts(
         raise SettingsError(f"integrator {integrator!r} is unknown; choose one of {', '.join(INTEGRATORS)}.")
     if hold not in HOLDS:
         raise SettingsError(f"hold {hold!r} is unknown; choose one of {', '.join(HOLDS)}.")
+    if isinstance(model, MujocoModel):
+        return _by_mujoco(model, scored, hold)
     if substeps < 1:
         raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
     if not model.dynamics.is_a("SXFunction"):
         raise ModelError(f"the dynamics of model {model.name!r} are not made of SX symbols; expand them: .expand().")
     return _rollouts(model, scored, integrator, int(substeps), hold, target)
+
+
+@lru_cache(maxsize=32)
+def _by_mujoco(model: MujocoModel, signals: tuple[str, ...], hold: str) -> Simulator:
+    """Rollouts by MuJoCo, by value of what defines them."""
+    from diransac.simulation.mujoco import MujocoRollouts
+
+    return MujocoRollouts(model, signals, hold)
 
 
 @lru_cache(maxsize=64)

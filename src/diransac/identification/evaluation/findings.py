@@ -11,6 +11,7 @@ from diransac.identification.diagnosis import departures
 from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.finding import FAR, VALIDATE, Finding, Level, by_seriousness, graded
 from diransac.identification.regression.uncertainty import CLEAR
+from diransac.model.parameter import parameter_of
 from diransac.text_table import duration, number, percent, plural, share
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
 def _bounds(result: Result) -> Iterator[Finding]:
     parameters = result.model.parameters
     for name in result.violations:
-        bounds = parameters[name.partition("[")[0]]
+        bounds = parameters[parameter_of(name, parameters)]
         value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
         claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
         yield Finding("bad", claim, _remedy(result, "bad"))
@@ -121,7 +122,7 @@ def _known(result: Result) -> Iterator[Finding]:
         value = f"{number(result.parameters[name])} {result.units[name]}".rstrip()
         yield Finding("note", f"{name} is fixed at {value}, not identified.")
     for name, x in result.estimate.parameters.items():
-        mean, std = result.priors.get(name.partition("[")[0], (np.nan, np.nan))
+        mean, std = result.priors.get(parameter_of(name, result.model.parameters), (np.nan, np.nan))
         away = abs(x - mean) / std
         if away > CLEAR:
             text = (
@@ -342,7 +343,7 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
     widths: dict[str, float] = {}
     intervals = {n: x for n, x in result.intervals().items() if n not in result.fixed}
     unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
-    stuck = {name.partition("[")[0] for name in result.on_bounds}
+    stuck = {parameter_of(name, result.model.parameters) for name in result.on_bounds}
     lost = [name for name in unknown if name not in stuck]
     if lost and not result.separates_forces:
         rows = plural(result.n_fitted, "fitted row")
@@ -377,7 +378,7 @@ def _differ(names: Sequence[str]) -> str:
 
 def _more_of(result: Result, names: Sequence[str]) -> str:
     """Action for uncertain parameters: a motion that moves their terms more, or a value from elsewhere."""
-    one = names[0].partition("[")[0]
+    one = parameter_of(names[0], result.model.parameters)
     if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > _HALF for x in result.logs):
         return _remedy(result)
     return f"record a log in which the term of {one} is larger, or fix it: --fix {one}=VALUE"

@@ -98,7 +98,8 @@ class Ambiguity:
 
     def remedy(self) -> str:
         """Argument and option that fix the first parameter, for example."""
-        name = self.names[0].partition("[")[0]
+        first = self.names[0]
+        name = first if "/" in first else first.partition("[")[0]  # a mask's index is part of the name
         return f'by fixed={{"{name}": ...}} or --fix {name}=...'
 
     def sentence(self, clause: str, logs: str = "") -> str:

@@ -97,7 +97,7 @@ class KnownParameters:
         Of as many parameters as are ambiguous, those with the smallest relative deviation.
         """
         model, found = self.model.with_fixed(self.fixed), list[str]()
-        for ambiguity in structural(model) if self.priors else ():
+        for ambiguity in structural(model) if self.priors and model.has_equations else ():
             shared = [n for n in ambiguity.names if n in self.priors and not model.parameters[n].per_log]
             shared.sort(key=lambda n: self.priors[n][1] / (abs(self.priors[n][0]) or np.finfo(float).tiny))
             n_free = len(ambiguity.names) - ambiguity.n_determined
@@ -139,7 +139,8 @@ class KnownParameters:
             return estimate
         layout = ParameterLayout(self.model.parameters, n_logs, self.priors)
         known = {**self.fixed, **{n: self.priors[n][0] for n in self.held}}
-        every = {n: estimate.parameters.get(n, known.get(n.partition("[")[0], np.nan)) for n in layout.names}
+        owned = zip(layout.names, layout.owners, strict=True)
+        every = {n: estimate.parameters.get(n, known.get(owner, np.nan)) for n, owner in owned}
         values, covariance = np.array(list(every.values())), np.zeros((len(layout), len(layout)))
         places = [layout.names.index(n) for n in estimate.parameters]
         covariance[np.ix_(places, places)] = estimate.covariance
@@ -164,7 +165,7 @@ class KnownParameters:
             own = layout.index[i, free]
             changes[own] = structural_slopes(model, values[own], given)
         changes *= [self.priors[n][1] for n in self.held]
-        late = np.array([k for k, n in enumerate(layout.names) if n.partition("[")[0] in self._late], np.int64)
+        late = np.array([k for k, n in enumerate(layout.owners) if n in self._late], np.int64)
         return combined(
             values, covariance + changes @ changes.T, late, layout.prior_mean[late], np.square(layout.prior_std[late])
         )

@@ -302,7 +302,7 @@ def unidentifiable(
     """
     of_model = structural(model, measured, ranges)
     ambiguous = {name for x in of_model for name in x.names}
-    by_equations = np.array([name.partition("[")[0] in ambiguous for name in layout.names])
+    by_equations = np.array([name in ambiguous for name in layout.owners])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)
     sentences = [x.sentence(x.of_equations()) for x in of_model]
     sentences += [in_words([x], layout.n_logs) for x in from_log if x.n_determined]

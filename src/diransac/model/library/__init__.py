@@ -20,6 +20,7 @@ from diransac.model.library.underwater_vehicle import underwater_vehicle
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from diransac.model.mjcf import mujoco
     from diransac.model.model import Model
     from diransac.model.robots import body_position, coordinates_of_bodies, drive_forces, robot, robot_limits
 
@@ -37,6 +38,7 @@ __all__ = [
     "drive_forces",
     "extended_rotorcraft",
     "flexible_joint",
+    "mujoco",
     "planar_rotorcraft",
     "quadrotor",
     "robot",
@@ -62,11 +64,11 @@ BUILTIN: dict[str, Callable[[], Model]] = {
 
 def __getattr__(name: str) -> Any:
     """Functions that read descriptions of robots, imported at their first use."""
-    if name not in ("body_position", "coordinates_of_bodies", "drive_forces", "robot", "robot_limits"):
+    if name not in ("body_position", "coordinates_of_bodies", "drive_forces", "mujoco", "robot", "robot_limits"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from diransac.model import robots
+    from diransac.model import mjcf, robots
 
-    globals()[name] = found = getattr(robots, name)
+    globals()[name] = found = getattr(mjcf if name == "mujoco" else robots, name)
     return found
 
 

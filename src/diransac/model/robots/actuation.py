@@ -119,11 +119,15 @@ class PositionControl(_Saturating):
         patterns = {self.target: position, self.velocity: f"{position}/s", self.feedforward: force}
         return {pattern.format(joint): unit for pattern, unit in patterns.items() if pattern is not None}
 
+    def gains(self, joint: str) -> tuple[float, float]:
+        """Stiffness and damping of a joint."""
+        return _of_joint("kp", self.kp, joint), _of_joint("kd", self.kd, joint)
+
     def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
         """``clip(kp (target - q) + kd (target' - q') + feedforward)``."""
         v_target = 0.0 if self.velocity is None else u[self.velocity.format(joint)]
         further = 0.0 if self.feedforward is None else u[self.feedforward.format(joint)]
-        kp, kd = _of_joint("kp", self.kp, joint), _of_joint("kd", self.kd, joint)
+        kp, kd = self.gains(joint)
         return _saturated(kp * (u[self.target.format(joint)] - q) + kd * (v_target - v) + further, self.limit, joint)
 
 
@@ -160,10 +164,13 @@ class MotorCurrents(_Saturating):
         """Column of the current."""
         return {self.current.format(joint): "A"}
 
+    def force_per_current(self, joint: str) -> float:
+        """Force of a joint per ampere, N m/A or N/A."""
+        return _of_joint("gear", self.gear, joint) * _of_joint("constant", self.constant, joint)
+
     def force(self, joint: str, q: Any, v: Any, u: Any) -> Any:
         """``clip(gear constant current)``."""
-        gain = _of_joint("gear", self.gear, joint) * _of_joint("constant", self.constant, joint)
-        return _saturated(gain * u[self.current.format(joint)], self.limit, joint)
+        return _saturated(self.force_per_current(joint) * u[self.current.format(joint)], self.limit, joint)
 
 
 def drive_forces(actuation: Actuation, joints: Collection[str]) -> Callable[..., dict[str, Any]]:

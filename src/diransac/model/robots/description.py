@@ -186,7 +186,7 @@ def parsed(path: str | Path) -> Any:
         raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
     check_description(Path(path), f'robot description "{path}"')
     try:
-        with _without_warnings():
+        with without_warnings():
             return mujoco.MjSpec.from_file(str(path))
     except _FAILURES as error:
         raise _unreadable(path, error) from error
@@ -226,7 +226,7 @@ def _description(path: str | Path, base: str | None) -> Description:
     _drop_shapes(spec)
     try:
         spec.compiler.fusestatic = False
-        with _without_warnings():
+        with without_warnings():
             model = spec.compile()
     except _FAILURES as error:
         raise _unreadable(path, error) from error
@@ -244,7 +244,7 @@ def _description(path: str | Path, base: str | None) -> Description:
 
 
 @contextmanager
-def _without_warnings() -> Iterator[None]:
+def without_warnings() -> Iterator[None]:
     """Context of one thread at a time in which MuJoCo warns of nothing, neither here nor in MUJOCO_LOG.TXT.
 
     It warns of what is left out, such as cloth.

@@ -15,7 +15,7 @@ from xml.parsers import expat
 from diransac.errors import ModelError
 from diransac.limits import LARGEST_TABLE, MOST_CELLS, MOST_ELEMENTS, beyond, check_ordinary, read_bytes
 
-__all__ = ["check_description"]
+__all__ = ["check_description", "check_text"]
 
 
 def check_description(path: Path, label: str) -> None:
@@ -32,6 +32,25 @@ def check_description(path: Path, label: str) -> None:
         raise ModelError(f"{label} cannot be read: {error.strerror}{name}") from error
     except ValueError as error:
         raise ModelError(f"{label} cannot be read: {error}") from error
+
+
+def check_text(text: bytes, label: str) -> None:
+    """Raise ModelError where a description that is to need no other file names one, or describes too much."""
+    parser, others = expat.ParserCreate(), list[str]()
+
+    def start(name: str, attributes: Mapping[str, str]) -> None:
+        # Attributes that name files: file, fileright, ..., contenttype's file.
+        if name in ("include", "plugin", "extension") or any(key.startswith("file") for key in attributes):
+            others.append(name)
+
+    parser.StartElementHandler = start
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise ModelError(f"{label} is no XML: {error}") from error
+    if others:
+        raise ModelError(f"{label} needs other files, or plugins, in its element {others[0]}")
+    _Counts(label, Path()).count(text, 1.0)
 
 
 @dataclass
@@ -55,7 +74,11 @@ class _Counts:
 
     def read(self, path: Path, copies: float) -> None:
         """Count what a file has, so many times.  Raises ModelError, OSError, ValueError: as `check_description`."""
-        content, stack = read_bytes(path, 64 * LARGEST_TABLE), [copies]
+        self.count(read_bytes(path, 64 * LARGEST_TABLE), copies)
+
+    def count(self, content: bytes, copies: float) -> None:
+        """Count what a text has, so many times."""
+        stack = [copies]
         parser = expat.ParserCreate()
 
         def start(name: str, attributes: Mapping[str, str]) -> None:

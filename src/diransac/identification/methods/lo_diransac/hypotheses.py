@@ -155,7 +155,7 @@ def _linear(
 def _in_sensors_alone(dataset: Dataset) -> BoolArray:
     """Mask ``(n,)`` of the parameters that no equation of motion depends on."""
     alone = dataset.model.sensor_parameters
-    return np.array([name.partition("[")[0] in alone for name in dataset.layout.names], bool)
+    return np.array([name in alone for name in dataset.layout.owners], bool)
 
 
 def _nonlinear(

@@ -31,6 +31,7 @@ from diransac.identification.methods.lo_diransac.projection import ProjectedEsti
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -159,6 +160,8 @@ class LoDiransac(LoDiransacSettings):
         TimeLimitError
             The time limit was reached before the first local optimisation had converged.
         """
+        if not dataset.model.has_equations:
+            return estimated_by_simulation(self, dataset, callback)
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
         with memory:
             return _fitted(self, dataset, int(seed), callback)

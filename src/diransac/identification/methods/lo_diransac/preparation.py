@@ -21,11 +21,13 @@ from diransac.identification.methods.lo_diransac.smoothing import Motion, Sample
 from diransac.simulation import default_threads
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.data.dataset import Dataset
     from diransac.data.segment import Segment
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 
-__all__ = ["prepared"]
+__all__ = ["cut", "prepared", "screened"]
 
 _FEWEST_INTERVALS = 4
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
@@ -53,12 +55,12 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
         The logs are too short.
     """
     model, dt = dataset.model, dataset.dt
-    screened = [_screened(settings, one, dt) for one in dataset.segments]
-    samples, inputs = [x for x, _, _ in screened], [u for _, u, _ in screened]
+    found = [screened(settings, one, dt) for one in dataset.segments]
+    samples = [x for x, _, _ in found]
     several = len(samples) > 1
     notes = [
         f"{one.log.source}: {note}" if several else note
-        for one, (_, _, said) in zip(dataset.segments, screened, strict=True)
+        for one, (_, _, said) in zip(dataset.segments, found, strict=True)
         for note in said
     ]
     halves, length = choose_half_widths(model, samples, dt, settings.smoothing_half_width)
@@ -74,20 +76,50 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
             "log with longer stretches"
         )
     motions = smooth(model, samples, dt, halves)
-    logs = [(x.measured, x.known, u, x.gaps) for x, u in zip(samples, inputs, strict=True)]
-    intervals = ShootingIntervals.of(model, dataset.layout, logs, dt, length, settings.substeps, dataset.hold)
-    intervals = replace(intervals, threads=settings.criteria.threads or default_threads())
+    intervals = cut(settings, dataset, found, length)
     rows = zip(motions, intervals.rows_of_logs, strict=True)
     signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
     return intervals, Motion(signals, motions[0].spread), tuple(notes)
+
+
+def cut(
+    settings: LoDiransacSettings,
+    dataset: Dataset,
+    samples: Sequence[tuple[Samples, FloatArray, list[str]]],
+    length: int,
+) -> ShootingIntervals:
+    """Intervals of the logs.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    dataset : Dataset
+    samples : sequence of (Samples, (N, n_u) array, list of str)
+        Of each log, as from `screened`.
+    length : int
+        Rows of an interval.
+    """
+    logs = [(x.measured, x.known, u, x.gaps) for x, u, _ in samples]
+    found = ShootingIntervals.of(
+        dataset.model, dataset.layout, logs, dataset.dt, length, settings.substeps, dataset.hold
+    )
+    return replace(found, threads=settings.criteria.threads or default_threads())
 
 
 def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
     return np.pad(values, ((0, n_rows - len(values)), (0, 0)), mode="edge")
 
 
-def _screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
-    """Samples and inputs of one log, and findings, a sentence each."""
+def screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
+    """Samples and inputs of one log, and findings, a sentence each.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    one : Segment
+    dt : float
+        Sampling time, s.
+    """
     model, notes = one.model, []
     measured = np.full((len(one), len(model.signals)), np.nan)
     measured[:, [model.signals.index(n) for n in one.signals]] = one.measured

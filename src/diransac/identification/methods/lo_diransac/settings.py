@@ -13,6 +13,8 @@ from diransac.errors import SettingsError
 from diransac.identification.settings import JUDGING, Settings, check_substeps, check_used
 
 if TYPE_CHECKING:
+    from diransac.arrays import FloatArray
+    from diransac.data.dataset import ParameterLayout
     from diransac.identification.structure.candidate_terms import TermLibrary
     from diransac.model import Model
 
@@ -91,6 +93,19 @@ class LoDiransacSettings:
     def forces_timing(self) -> bool:
         """True if a delay or a lag of the inputs is estimated in any case."""
         return bool(self.input_delay or self.input_lag)
+
+    def start_of(self, layout: ParameterLayout) -> FloatArray | None:
+        """The user's start ``(n,)``, means of priors and nominal values, in this order; one where there is none of these.
+
+        None where there is none of any parameter.
+        """
+        found, start = [], self.start or {}
+        given = zip(layout.owners, layout.bounds, layout.prior_mean, layout.prior_std, strict=True)
+        for name, bound, mean, std in given:
+            nominal = mean if np.isfinite(std) else bound.value
+            found.append(start.get(name, nominal))
+        known = [x for x in found if x is not None]
+        return np.array([1.0 if x is None else x for x in found], float) if known else None
 
     def regresses(self, model: Model) -> bool:
         """False: sensors are compared with simulations."""

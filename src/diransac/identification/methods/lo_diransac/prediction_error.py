@@ -1,0 +1,485 @@
+"""Parameters of a machine that only a simulator knows, by the errors of one-interval predictions.
+
+States are followed from interval to interval, so that contacts settle as they do in the simulator, and what nothing
+measures, such as the pose of a base that walks, follows from all sensors.  With the parameters at p, a state is
+``x = m + M (p' - p) + e`` for other parameters p', with a covariance of e: a Kalman filter that carries the
+sensitivity M of its mean.  The samples of an interval contribute to the gradient and to the information of the
+parameters, as those of the joint fit do after its states are eliminated; Gauss-Newton steps on these sums, each a pass
+over the logs, and updates of the noise (a mixture with outliers) and of what the model lacks lead to the estimate.
+
+References
+----------
+Astrom 1980 (prediction errors); Gupta, Mehra 1974 (sensitivities of the filter); Dempster, Laird, Rubin 1977 (noise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import FloatArray
+from diransac.data.input_timing import acting_inputs
+from diransac.identification.methods.lo_diransac.mixture import Mixture
+from diransac.simulation import LinearizedErrors, Measurements, RolloutBatch, default_threads, rollouts
+from diransac.time_limit import check_time
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.simulation.mujoco import MujocoRollouts
+
+__all__ = ["Pass", "Predictor", "minimised"]
+
+_FIRST = 5
+"""Samples of which the median is a first state."""
+_UNSURE = {"m": 0.05, "rad": 0.3, "1": 0.05}
+"""Standard deviation at the start of coordinates that nothing measures; of velocities, in a second, ten times that."""
+_LACKS, _LEAST_LACKS = 0.3, 1e-4
+"""Change of a velocity in an interval that the model lacks, at first and at least, of the change that it predicts."""
+_SMALL = 1e-3
+"""Least change of a velocity of which the model lacks a part, over its size."""
+_FIRST_NOISE, _LEAST_NOISE, _TINY = 3.0, 1e-3, 1e-12
+"""Noise of a signal before anything is fitted, over that of its bends; at least, over its spread."""
+_OF_NORMAL = 1.4826
+_LOST, _ROUNDING = 1e4, 1e-12
+_SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
+"""Weights of an interval's samples that are tried."""
+_TOLD = 0.3
+"""Part of the variance of a velocity that samples must take away to tell what the model lacks."""
+_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 16, 0.3, 0.05, 3
+"""Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; halved steps."""
+_EARLY, _FIRM = 3, 1e12
+"""Passes before a delay is estimated, for which wrong parameters would stand."""
+_WIDE, _NARROW = 0.1, 1e-5
+"""Differences of parameters, over their sizes."""
+_DELAY_STEP = 0.5
+"""Difference of a delay, samples."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Predictions of all intervals with one set of parameters.
+
+    Parameters
+    ----------
+    loss, lost : float
+        Negative log-likelihood of the predicted samples; the part of intervals in which simulations diverge.
+    scores : (W, n) array
+        Contribution of each interval to minus the gradient of the loss with respect to the parameters, the delay of
+        the inputs last if it is estimated.
+    information : (n, n) array
+    states : (W, n_x) array
+        At the intervals' starts, after their samples.
+    jumps : (W, n_x) array
+        From the ends of the intervals before; 0 where nothing is before.
+    residuals : (N, n_s) array
+        Simulated from these states less measured.
+    surprise : float
+        Mean square of the changes of velocities by samples, over what the filter expects.
+    errors, expected : (N, n_s) array
+        Predicted less measured, and the variance of the prediction.
+    """
+
+    loss: float
+    lost: float
+    scores: FloatArray
+    information: FloatArray
+    states: FloatArray
+    jumps: FloatArray
+    residuals: FloatArray
+    surprise: float
+    errors: FloatArray
+    expected: FloatArray
+
+    def loss_with(self, noise: Mixture, known: BoolArray) -> float:
+        """The loss with another noise, and states as uncertain as they were."""
+        wide = np.sqrt(1.0 + self.expected / np.square(noise.sigma))
+        own = noise.negative_log_likelihood(self.errors / wide, known) + known * np.log(wide)
+        return float(own.sum()) + self.lost
+
+    def step(self, precision: FloatArray, pull: FloatArray) -> FloatArray:
+        """Gauss-Newton step ``(n,)`` with priors; 0 in directions of which the logs tell nothing."""
+        return self.covariance(precision) @ (self.scores.sum(axis=0) + pull)
+
+    def covariance(self, precision: FloatArray) -> FloatArray:
+        """Covariance ``(n, n)`` by the noise; 0 of what the logs tell nothing of."""
+        information = self.information + np.diag(precision)
+        d = np.sqrt(np.maximum(np.diag(information), 0.0))
+        scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > _TINY)
+        return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Passes over the intervals of some logs.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    noise : Mixture
+    lacks : float
+        Change of a velocity in an interval that the model lacks, of the change that it predicts.
+    delay : float
+        Of the inputs, samples.
+    free_delay : bool
+        Whether it is estimated.
+    wide : bool
+        Whether slopes are taken over a tenth of the parameters: rollouts jump where a contact begins a step earlier.
+    """
+
+    intervals: ShootingIntervals
+    noise: Mixture
+    lacks: float = _LACKS
+    delay: float = 0.0
+    free_delay: bool = True
+    wide: bool = True
+
+    @classmethod
+    def of(cls, intervals: ShootingIntervals, *, outliers: bool, free_delay: bool) -> Predictor:
+        """A predictor with noise by the bends of each signal."""
+        n = len(intervals.model.signals)
+        spread, noise = np.ones(n), np.ones(n)
+        low, high = np.zeros(n), np.ones(n)
+        for j in np.flatnonzero(intervals.known.any(axis=0)):
+            y = intervals.measured[intervals.known[:, j], j]
+            low[j], high[j] = y.min(), max(y.max(), y.min() + _TINY)
+            spread[j] = _robust(y - np.median(y)) or np.ptp(y) or 1.0
+            bends = np.diff(y, 2) if len(y) > _FIRST else np.zeros(1)
+            noise[j] = max(_FIRST_NOISE * _robust(bends) / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], _TINY)
+        pi = np.full(n, 0.1 if outliers else 0.0)
+        floor = np.maximum(1e-2 * _LEAST_NOISE * spread, _TINY)
+        seen = intervals.known.any(axis=0)
+        whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
+        for four in whole:
+            noise[list(four)], floor[list(four)] = noise[list(four)].max(), floor[list(four)].max()
+        return cls(intervals, Mixture(noise, pi, high - low, floor, whole), free_delay=free_delay)
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """Signals that the logs have."""
+        return np.flatnonzero(self.intervals.sampled.any(axis=0))
+
+    @cached_property
+    def _simulator(self) -> MujocoRollouts:
+        from diransac.simulation.mujoco import MujocoRollouts
+
+        model = self.intervals.model
+        found = rollouts(model, [model.signals[k] for k in self.columns], hold=self.intervals.hold)
+        assert isinstance(found, MujocoRollouts)
+        return found
+
+    @cached_property
+    def _measurements(self) -> Measurements:
+        values = np.ascontiguousarray(self.intervals.measured[:, self.columns])
+        return Measurements(values, np.ones(len(values), bool))
+
+    def acting(self, delay: float) -> FloatArray:
+        """Inputs ``(N, n_u)`` after a delay, samples."""
+        one = self.intervals
+        late, none = np.full(one.recorded.shape[1], delay), np.zeros(one.recorded.shape[1])
+        parts = [
+            acting_inputs(one.recorded[rows], late, none, none, one.hold, int(one.is_logged[rows].sum()))
+            for rows in one.rows_of_logs
+        ]
+        return np.concatenate(parts)
+
+    @cached_property
+    def unsure(self) -> FloatArray:
+        """Standard deviation ``(n_x,)`` of the first state."""
+        model, n_x = self.intervals.model, self.intervals.model.n_q + self.intervals.model.n_v
+        units = [*model.coordinates.values(), *(x.partition("/")[0] for x in model.velocities.values())]
+        unsure = np.array([_UNSURE.get(x, 0.3) for x in units])
+        unsure[model.n_q :] *= 10.0
+        seen = self.intervals.known.any(axis=0)[:n_x]
+        return np.where(seen, np.minimum(self.noise.sigma[:n_x] + 0.03 * unsure, unsure), unsure)
+
+    def first_state(self, w: int, rest: FloatArray) -> FloatArray:
+        """State at an interval's start: medians of the first samples, of what nothing measures the rest."""
+        state, rows = rest.copy(), self.intervals.starts[w] + np.arange(self.intervals.length)
+        for j in range(len(state)):
+            known = rows[self.intervals.known[rows, j]][:_FIRST]
+            if len(known):
+                state[j] = np.median(self.intervals.measured[known, j])
+        return state
+
+    def over_logs(self, p: FloatArray) -> Pass:
+        """Predictions with parameters ``(n_p,)``."""
+        one, inputs = self.intervals, self.acting(self.delay)
+        later = self.acting(self.delay + _DELAY_STEP) if self.free_delay else None
+        run = _Run(self, p, inputs, later)
+        state, belief = self.first_state(0, one.model.home), _Belief.begin(self.unsure, run.n)
+        for w in range(len(one)):
+            if w and not one.following[w]:
+                rest = one.model.home if one.log_of[w] != one.log_of[w - 1] else state
+                state, belief = self.first_state(w, rest), _Belief.begin(self.unsure, run.n)
+            state, belief = run.interval(w, state, belief)
+        return run.result()
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """What is known of a state: its covariance, and the change of its mean with the parameters."""
+
+    covariance: FloatArray
+    slopes: FloatArray
+
+    @classmethod
+    def begin(cls, unsure: FloatArray, n: int) -> _Belief:
+        return cls(np.diag(np.square(unsure)), np.zeros((len(unsure), n)))
+
+
+class _Run:
+    """One pass."""
+
+    def __init__(self, predictor: Predictor, p: FloatArray, inputs: FloatArray, later: FloatArray | None) -> None:
+        self.predictor, self.p, self.inputs, self.later = predictor, p, inputs, later
+        one = predictor.intervals
+        self.n = len(p) + (later is not None)
+        self.states = np.empty((len(one), one.model.n_q + one.model.n_v))
+        self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
+        self.information, self.loss, self.lost = np.zeros((self.n, self.n)), 0.0, 0.0
+        self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
+        self.surprise = list[FloatArray]()
+        self.threads = one.threads if one.threads > 1 else default_threads()
+
+    def result(self) -> Pass:
+        """Sums of all intervals."""
+        surprise = float(np.mean(self.surprise)) if self.surprise else 1.0
+        kept = (self.states, self.jumps, self.residuals, surprise, self.errors, self.expected)
+        return Pass(self.loss + self.lost, self.lost, self.scores, self.information, *kept)
+
+    def batch(self, w: int, state: FloatArray, inputs: FloatArray) -> RolloutBatch:
+        """One lane over an interval."""
+        one = self.predictor.intervals
+        parameters = one.parameters_of(self.p, one.log_of[w : w + 1])
+        lane = parameters if parameters.ndim == 2 else parameters[None]
+        return RolloutBatch(lane, state[None], inputs, one.dt, one.starts[w : w + 1], one.length, one.first_of_log)
+
+    def linearized(self, w: int, state: FloatArray) -> LinearizedErrors:
+        """Errors of an interval and their derivatives with respect to state, parameters and delay."""
+        predictor, model = self.predictor, self.predictor.intervals.model
+        simulator, measurements = predictor._simulator, predictor._measurements
+        names = (*model.state, *model.parameters)
+        found = simulator.linearized_errors(
+            self.batch(w, state, self.inputs),
+            measurements,
+            unknowns=names,
+            threads=self.threads,
+            step=_WIDE if predictor.wide else _NARROW,
+        )
+        if self.later is None:
+            return found
+        late, end = simulator.errors_and_ends(self.batch(w, state, self.later), measurements, threads=1)
+        assert found.final_states is not None and found.final_slopes is not None
+        of_delay = (late - found.errors) / _DELAY_STEP
+        of_end = (end - found.final_states) / _DELAY_STEP
+        return replace(
+            found,
+            jacobian=np.concatenate([found.jacobian, of_delay[..., None]], axis=3),
+            final_slopes=np.concatenate([found.final_slopes, of_end[..., None]], axis=2),
+        )
+
+    def interval(self, w: int, state: FloatArray, belief: _Belief) -> tuple[FloatArray, _Belief]:
+        """State and belief at the end of an interval, after its samples."""
+        check_time()
+        one, columns, n_x = self.predictor.intervals, self.predictor.columns, len(state)
+        rows = slice(int(one.starts[w]), int(one.starts[w]) + one.length)
+        known = one.known[rows][:, columns]
+        at = self.linearized(w, state)
+        assert at.final_states is not None and at.final_slopes is not None
+        e, J, F = at.errors[0], at.jacobian[0], at.final_slopes[0]
+        if not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST):
+            self.states[w], self.lost = state, self.lost + 10.0 * float(known.sum())
+            return state, _Belief.begin(self.predictor.unsure, self.n)
+        noise = self._noise
+        expected = np.einsum("rsi,ij,rsj->rs", J[..., :n_x], belief.covariance, J[..., :n_x])
+        wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
+        weights = noise.inlying(e / wide, known) / np.square(noise.sigma)
+        self.loss += float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
+        update, ends = self._tempered(w, state, belief, (e, J, weights, at.final_states[0]))
+        self._count(w, update, belief)
+        self.states[w] = state + update.moved
+        self.errors[rows, columns] = np.where(known, e, 0.0)
+        self.expected[rows, columns] = expected
+        self.residuals[rows, columns] = np.where(known, e + J[..., :n_x] @ update.moved, 0.0)
+        return self._propagated(w, state, update, (at.final_states[0], F, ends))
+
+    def _tempered(
+        self, w: int, state: FloatArray, belief: _Belief, at: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+    ) -> tuple[_Update, FloatArray]:
+        """Update by the samples of an interval with as much weight as their linear model deserves, and the end after it.
+
+        Where a contact changes, a full step may lead to a motion that agrees less.
+        """
+        e, J, weights, end = at
+        predictor, known = self.predictor, weights > 0.0
+        before = float((weights * np.square(e)).sum())
+        for share in _SHARES:
+            update = _Update.of(belief, (e, J, share * weights))
+            found, ends = predictor._simulator.errors_and_ends(
+                self.batch(w, state + update.moved, self.inputs), predictor._measurements, threads=1
+            )
+            after = float(np.where(known, weights * np.square(found[0]), 0.0).sum())
+            if np.abs(ends[0]).max() < _LOST and share * after + update.prior <= share * before * (1.0 + _TINY):
+                return update, ends[0]
+        return _Update.of(belief, (e, J, 0.0 * weights)), end
+
+    def _count(self, w: int, update: _Update, belief: _Belief) -> None:
+        """Add an interval's contributions."""
+        n_q, continues = self.predictor.intervals.model.n_q, bool(self.predictor.intervals.following[w])
+        self.information += update.information
+        self.scores[w] = update.score
+        if not continues:
+            return
+        self.jumps[w] = update.moved
+        own = np.diag(belief.covariance)[n_q:]
+        less = own - np.diag(update.belief.covariance)[n_q:]
+        told = less > _TOLD * own
+        if told.any():
+            self.surprise.append(np.clip(np.square(update.moved[n_q:][told]) / less[told], 0.0, 9.0).mean())
+
+    @cached_property
+    def _noise(self) -> Mixture:
+        noise, columns = self.predictor.noise, self.predictor.columns
+        arrays = (noise.sigma, noise.pi, noise.span, noise.floor)
+        return Mixture(*(x[columns] for x in arrays))
+
+    def _propagated(
+        self, w: int, state: FloatArray, update: _Update, at: tuple[FloatArray, FloatArray, FloatArray]
+    ) -> tuple[FloatArray, _Belief]:
+        """State at the end of an interval, and what is known of it."""
+        predictor, belief, (end, F, ends) = self.predictor, update.belief, at
+        n_q, n_x = predictor.intervals.model.n_q, len(state)
+        nonlinear = ends - end - F[:, :n_x] @ update.moved
+        change = np.abs(ends - state - update.moved)
+        lacks = predictor.lacks * (change + _SMALL * predictor.unsure)[n_q:]
+        # A change of velocity on the way moves coordinates by half of what one at the start does.
+        effect = np.vstack([0.5 * F[:n_q, n_q:n_x], np.eye(n_x - n_q)])
+        spread = (effect * np.square(lacks)) @ effect.T + np.diag(np.square(nonlinear))
+        covariance = F[:, :n_x] @ belief.covariance @ F[:, :n_x].T + spread
+        slopes = F[:, n_x:] + F[:, :n_x] @ belief.slopes
+        return ends, _Belief(0.5 * (covariance + covariance.T), slopes)
+
+
+@dataclass(frozen=True)
+class _Update:
+    """Effect of the samples of an interval.
+
+    Parameters
+    ----------
+    moved : (n_x,) array
+        Change of the state at its start.
+    belief : _Belief
+        After it.
+    prior : float
+        Twice the cost of the change by what was known before.
+    information, score : (n, n) and (n,) array
+        Contributions to those of the parameters.
+    """
+
+    moved: FloatArray
+    belief: _Belief
+    prior: float
+    information: FloatArray
+    score: FloatArray
+
+    @classmethod
+    def of(cls, belief: _Belief, samples: tuple[FloatArray, FloatArray, FloatArray]) -> _Update:
+        """Update by errors, their derivatives and weights of an interval's samples."""
+        e, J, weights = (x.reshape(-1, *x.shape[2:]) for x in samples)
+        n_x = len(belief.slopes)
+        of_x, of_p = J[:, :n_x], J[:, n_x:] + J[:, :n_x] @ belief.slopes
+        own, scale = np.diag(belief.covariance), np.sqrt(weights)[:, None]
+        root = np.linalg.cholesky(belief.covariance + np.diag(_ROUNDING * own + _TINY**2))
+        # Rows of samples, and of what is known beforehand, in units of its root.
+        above = np.hstack([scale * of_x @ root, scale * of_p, -scale * e[:, None]])
+        R = np.linalg.qr(np.vstack([above, np.eye(n_x, above.shape[1])]), mode="r")
+        of_state, left = R[:n_x], R[n_x:, n_x:]
+        solved = np.linalg.solve(of_state[:, :n_x], np.column_stack([of_state[:, n_x:], np.eye(n_x)]))
+        slopes, moved, inverse = np.split(solved, [of_p.shape[1], of_p.shape[1] + 1], axis=1)
+        half = root @ inverse
+        return cls(
+            root @ moved[:, 0],
+            _Belief(half @ half.T, belief.slopes - root @ slopes),
+            float(np.square(moved).sum()),
+            left[:, :-1].T @ left[:, :-1],
+            left[:, :-1].T @ left[:, -1],
+        )
+
+
+def _robust(values: FloatArray) -> float:
+    """Standard deviation of the bulk."""
+    return float(_OF_NORMAL * np.median(np.abs(values)))
+
+
+def minimised(
+    predictor: Predictor, p: FloatArray, *, outliers: bool, progress: Callable[[int, Predictor, FloatArray, Pass], None] | None = None
+) -> tuple[Predictor, FloatArray, Pass, bool]:
+    """Parameters with the likeliest predictions, with noise and what the model lacks.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    p : (n_p,) array
+        To begin with.
+    outliers : bool
+        Whether the fraction of outliers is estimated.
+    progress : callable, optional
+        Called with the number of each pass, the predictor, the parameters and the pass.
+
+    Returns
+    -------
+    Predictor, (n_p,) array, Pass, bool
+        The last is False where passes did not converge.
+    """
+    layout, known = predictor.intervals.layout, predictor.intervals.known
+    converged, now = False, predictor.over_logs(p)
+    for k in range(_PASSES):
+        held = predictor.free_delay and k < _EARLY
+        if progress is not None:
+            progress(k, predictor, p, now)
+        none = np.zeros(int(predictor.free_delay))
+        precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
+        pull = precision * np.concatenate([layout.prior_mean - p, none])
+        noise = _noise_after(predictor, now, outliers=outliers)
+        factor = float(np.sqrt(np.clip(now.surprise, 0.1, 4.0)))
+        lacks = max(predictor.lacks * factor, _LEAST_LACKS)
+        following = replace(predictor, noise=noise, lacks=lacks, wide=k + 1 < _EARLY)
+        step, errors = now.step(np.append(precision[:-1], _FIRM) if held else precision, pull), np.sqrt(np.diag(now.covariance(precision)).clip(_TINY**2))
+        steady = np.abs(np.log(noise.sigma / predictor.noise.sigma)[predictor.columns]).max() < _SETTLED
+        if steady and (np.abs(step) < _CONVERGED * errors).all():
+            converged = True
+            break
+        before = now.loss_with(noise, known)
+        for _ in range(_HALVINGS):
+            then, predictor = _moved(following, p, step, held=held)
+            found = predictor.over_logs(then)
+            if found.loss < before + 0.01 * abs(before):
+                break
+            step = 0.5 * step
+        p, now = then, found
+    return predictor, p, now, converged
+
+
+def _noise_after(predictor: Predictor, now: Pass, *, outliers: bool) -> Mixture:
+    """The noise by the residuals of a pass."""
+    known = predictor.intervals.known
+    inlying = predictor.noise.inlying(now.residuals, known)
+    return predictor.noise.updated(now.residuals, known, inlying, outliers=outliers)
+
+
+def _moved(predictor: Predictor, p: FloatArray, step: FloatArray, *, held: bool) -> tuple[FloatArray, Predictor]:
+    """Parameters after a step within their bounds, and the predictor with the delay after it."""
+    then = p + step[: len(p)]
+    for j, bounds in enumerate(predictor.intervals.layout.bounds):
+        then[j] = np.clip(then[j], bounds.lower, bounds.upper)
+        if p[j] > 0.0 and (bounds.positive or bounds.lower == 0.0):
+            then[j] = np.clip(then[j], 0.5 * p[j], 2.0 * p[j])
+    if held or not predictor.free_delay:
+        return then, predictor
+    return then, replace(predictor, delay=float(np.clip(predictor.delay + np.clip(step[-1], -1.0, 1.0), -2.0, 50.0)))
+

@@ -1,0 +1,216 @@
+"""lo-diransac for a model without equations: an estimate by `prediction_error`, with its diagnosis.
+
+Nothing here regresses, smooths or differentiates; hypotheses are the nominal values, or the user's start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.data.input_timing import InputTiming
+from diransac.errors import IdentificationError, LogError, TimeLimitError
+from diransac.identification.diagnosis import Diagnosis, Resolution
+from diransac.identification.estimate import TIME_LIMIT, Estimate
+from diransac.identification.finding import Finding
+from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
+from diransac.identification.methods.lo_diransac.prediction_error import Pass, Predictor, minimised
+from diransac.identification.methods.lo_diransac.preparation import cut, screened
+from diransac.text_table import duration
+
+if TYPE_CHECKING:
+    from diransac.data.dataset import Dataset
+    from diransac.identification.method import Callback
+    from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+
+__all__ = ["estimated_by_simulation"]
+
+_SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
+"""Samples of an interval; intervals of the logs at least."""
+_NOTHING_KNOWN, _SMALL = 1.0, 0.01
+"""Standard error of a parameter over its size from which on a log tells nothing of it; size at least."""
+_LEAST_DELAY = 0.05
+"""Delay, samples, that is none."""
+_OUTLIER, _GAUSSIAN, _TINY = 0.5, 10_000, 1e-300
+
+
+def estimated_by_simulation(
+    settings: LoDiransacSettings, dataset: Dataset, callback: Callback | None = None
+) -> Estimate:
+    """Parameters of a model without equations from the logs.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    dataset : Dataset
+    callback : callable, optional
+        Called with a `Progress` at every pass.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    LogError
+        The logs are too short.
+    IdentificationError
+        Simulations diverge in most of the logs.
+    TimeLimitError
+        The time limit was reached before a pass over the logs had ended.
+    """
+    report(callback, "following the motion", 0.0)
+    samples = [screened(settings, one, dataset.dt) for one in dataset.segments]
+    length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), _SHORTEST, _LONGEST))
+    n_rows = sum(map(len, dataset.segments))
+    if n_rows < _FEWEST_INTERVALS * length:
+        least = _FEWEST_INTERVALS * length
+        raise LogError(f"{dataset.source}: {n_rows} rows are too few; it needs at least {least}. Give a longer log")
+    intervals = replace(cut(settings, dataset, samples, length), discrepancies=False)
+    begin = settings.start_of(dataset.layout)
+    begin = np.ones(len(dataset.layout)) if begin is None else begin
+    free = settings.input_delay is not False and bool(np.ptp(intervals.recorded, axis=0).any())
+    last = list[tuple[Predictor, FloatArray, Pass]]()
+
+    def progress(k: int, predictor: Predictor, p: FloatArray, now: Pass) -> None:
+        last[:] = [(predictor, p, now)]
+        text = f"pass {k + 1}: negative log-likelihood {now.loss:.6g}"
+        report(callback, "prediction errors", min(0.05 + 0.05 * k, 0.85), text)
+
+    predictor, ended = Predictor.of(intervals, outliers=settings.outliers, free_delay=free), "converged"
+    try:
+        predictor, p, now, converged = minimised(predictor, begin, outliers=settings.outliers, progress=progress)
+        ended = "converged" if converged else "limit of passes"
+    except TimeLimitError:
+        if not last:
+            raise
+        (predictor, p, now), ended = last[0], TIME_LIMIT
+    if now.lost > 0.5 * 10.0 * float(intervals.known.sum()):
+        raise IdentificationError(
+            f"{dataset.source}: simulations diverge in most of the log from {', '.join(map(str, dataset.layout.names[:3]))}"
+            ", ... as in the file; correct its values, or give start="
+        )
+    notes = tuple(dict.fromkeys(x for _, _, said in samples for x in said))
+    return _Found(settings, dataset, predictor, p, now, ended, notes).estimate()
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What passes over the logs have found."""
+
+    settings: LoDiransacSettings
+    dataset: Dataset
+    predictor: Predictor
+    parameters: FloatArray
+    last: Pass
+    ended: str
+    notes: tuple[str, ...]
+
+    def covariance(self) -> FloatArray:
+        """Covariance ``(n, n)``, the delay's last if it is estimated.
+
+        It is increased where scores of neighbouring intervals scatter more than by white noise (Huber 1967, by batches),
+        and by the step that is left.
+        """
+        layout, none = self.dataset.layout, np.zeros(int(self.predictor.free_delay))
+        precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
+        pull = precision * np.concatenate([layout.prior_mean - self.parameters, none])
+        white = self.last.covariance(precision)
+        scatter = np.square(batch_sums(self.last.scores @ white)).sum(axis=0)
+        more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + _TINY)))
+        left = self.last.step(precision, pull)
+        return white * np.outer(more, more) + np.diag(np.square(left))
+
+    def estimate(self) -> Estimate:
+        """The estimate."""
+        dataset, n = self.dataset, len(self.parameters)
+        whole = self.covariance()
+        covariance, lost = whole[:n, :n].copy(), self._lost(whole)
+        covariance[lost] = covariance[:, lost] = np.inf
+        names = dataset.layout.names
+        delay_error = float(np.sqrt(whole[-1, -1])) if self.predictor.free_delay else np.inf
+        late = self._delay(delay_error)
+        timing = InputTiming.of(np.full(dataset.model.n_u, late * dataset.dt), *np.zeros((2, dataset.model.n_u)))
+        return Estimate(
+            parameters=dict(zip(names, self.parameters.tolist(), strict=True)),
+            covariance=covariance,
+            degrees_of_freedom=_GAUSSIAN,
+            n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
+            estimator="prediction errors",
+            stop_reason=self.ended,
+            resolution=Resolution("rk4", 1, self.predictor.intervals.hold, timing),
+            notes=self.notes,
+            diagnosis=self._diagnosis(tuple(n for n, x in zip(names, lost, strict=True) if x), delay_error),
+            checks=tuple(self._checks(late)),
+        )
+
+    def _delay(self, error: float) -> float:
+        """Delay of the inputs, samples; 0 where it is negligible, or not significant."""
+        size = abs(self.predictor.delay)
+        return self.predictor.delay if size > max(_LEAST_DELAY, 3.0 * error) or self.settings.input_delay else 0.0
+
+    def _lost(self, covariance: FloatArray) -> BoolArray:
+        """Parameters ``(n,)`` that the logs do not determine: nothing depends on them, or too little."""
+        n = len(self.parameters)
+        nominal = np.abs([x.value or 0.0 for x in self.dataset.layout.bounds])
+        size = np.maximum(np.maximum(np.abs(self.parameters), nominal), _SMALL)
+        told = np.diag(self.last.information)[:n] > 0.0
+        has_prior = np.isfinite(self.dataset.layout.prior_std)
+        return np.asarray(~has_prior & ~(told & (np.sqrt(np.diag(covariance)[:n]) < _NOTHING_KNOWN * size)))
+
+    def _checks(self, late: float) -> Iterator[Finding]:
+        """Findings on the fit."""
+        if self.ended not in ("converged", TIME_LIMIT):
+            yield Finding(
+                "care", "Passes over the log did not converge within their limit", "begin closer, with start= or --start"
+            )
+        if late:
+            text = f"the inputs act {duration(abs(late) * self.dataset.dt)} {'later' if late > 0.0 else 'earlier'} than"
+            yield Finding("note", f"{text[0].upper()}{text[1:]} recorded, which the estimate includes.")
+
+    def _diagnosis(self, lost: tuple[str, ...], delay_error: float) -> Diagnosis:
+        """Noise, outliers and unmodelled accelerations, by name and over the rows of the given logs."""
+        dataset, one, now, noise = self.dataset, self.predictor.intervals, self.last, self.predictor.noise
+        model, dt = dataset.model, one.dt
+        columns = {name: model.signals.index(name) for name in dataset.signals}
+        outliers = one.known & (noise.inlying(now.residuals, one.known) < _OUTLIER)
+        shown = one.is_logged[one.starts]
+        window_log = one.log_of[shown]
+        begins = np.array([x.log.time[x.offset] for x in dataset.segments])[window_log]
+        place = one.starts[shown] - one.first_of_log[window_log]
+        unmodelled = now.jumps[shown, model.n_q :] / one.duration
+        has = noise.has_outliers
+        return Diagnosis(
+            noise_std={name: float(noise.sigma[k]) for name, k in columns.items()},
+            outlier_fraction={name: float(noise.pi[k] if has[k] else outliers[:, k].mean()) for name, k in columns.items()},
+            outliers={name: self._on_given_logs(outliers[:, k]) for name, k in columns.items()},
+            window_log=window_log,
+            unmodelled_time=begins + dt * (place + 0.5 * (one.length - 1)),
+            unmodelled_accelerations=dict(zip(model.accelerations, unmodelled.T.copy(), strict=True)),
+            unmodelled_forces={},
+            smoothed_time=begins + dt * place.astype(float),
+            smoothed_states=dict(zip(model.state, now.states[shown].T.copy(), strict=True)),
+            input_delay=self.predictor.delay * dt,
+            input_delay_error=delay_error * dt,
+            input_delay_significant=bool(self._delay(delay_error)),
+            unidentifiable=lost,
+            combinations=tuple(_untold(name) for name in lost),
+        )
+
+    def _on_given_logs(self, mask: BoolArray) -> BoolArray:
+        """A mask over the intervals' rows as one over the rows of the logs."""
+        pairs = zip(self.predictor.intervals.rows_of_logs, self.dataset.segments, strict=True)
+        return self.dataset.on_given_logs([mask[rows][: len(one)] for rows, one in pairs])
+
+
+def _untold(name: str) -> str:
+    """Sentence on a parameter that the logs do not determine."""
+    cause = "the sensors show nothing of it in this motion"
+    if name.startswith(("geom/", "pair/")) and ".friction" in name:
+        cause = "no such contact slips in this log"
+    return f'{name} is not identifiable: {cause}; record another motion, or fix it, by fixed={{"{name}": ...}}'

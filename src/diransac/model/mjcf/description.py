@@ -1,0 +1,261 @@
+"""An MJCF or URDF as MuJoCo compiles it, without what is only looked at, and the names of its signals."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diransac.errors import ModelError
+from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
+from diransac.model.robots.description import mujoco_module, parsed, without_warnings
+from diransac.model.robots.mechanism import identifier
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from diransac.model.robots.actuation import Actuation
+
+__all__ = ["Drives", "JointColumns", "SensorColumns", "compiled_text", "file_drives", "joint_columns", "sensor_columns"]
+
+_FREE, _BALL = 0, 1
+_ALL = 8191
+"""``mjSTATE_FULLPHYSICS`` and all that a model may add to it is compared with positions, velocities and time."""
+
+
+@dataclass(frozen=True)
+class JointColumns:
+    """Columns of the state that a joint has.
+
+    Parameters
+    ----------
+    name : str
+    coordinates, velocities, accelerations : dict of str to str
+        Unit by name.
+    """
+
+    name: str
+    coordinates: dict[str, str]
+    velocities: dict[str, str]
+    accelerations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SensorColumns:
+    """Readings of a sensor.
+
+    Parameters
+    ----------
+    name : str
+    columns : tuple of str
+    unit : str
+    first : int
+        Place of the first reading in MuJoCo's ``sensordata``.
+    of_forces : bool
+        Whether accelerations or forces act on it.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    unit: str
+    first: int
+    of_forces: bool
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Inputs of a model, in the order of MuJoCo's controls: unit by name."""
+
+    inputs: dict[str, str]
+
+
+def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, Drives | None]:
+    """A description as one text that MuJoCo reads, without visual shapes and other files; and the drives' inputs.
+
+    Parameters
+    ----------
+    path : str or Path
+        MJCF or URDF.
+    actuation : Actuation, optional
+        Drives in place of the file's actuators; None: those.
+
+    Returns
+    -------
+    str
+    Drives or None
+        None: the file's actuators.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or has what is not simulated here: plugins, soft bodies, actuators with states; or
+        the drives are none that MuJoCo has.
+    """
+    label, spec = f'robot description "{path}"', parsed(path)
+    for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
+        if len(list(elements)):
+            raise ModelError(f"{label} has {what}, which are not simulated here; leave them out")
+    spec.compiler.discardvisual, spec.compiler.fusestatic = True, False
+    for element in (*spec.skins, *spec.lights, *spec.cameras):
+        spec.delete(element)
+    drives = None if actuation is None else _with_drives(label, spec, actuation)
+    home = _compiled(label, spec)
+    pose = home.key_qpos[0].copy() if home.nkey else None
+    for element in list(spec.keys):
+        spec.delete(element)
+    if pose is not None:
+        spec.add_key(name="home", qpos=pose)
+    compiled = _compiled(label, spec)
+    _check_state(label, compiled)
+    for mesh in list(spec.meshes):
+        _embed(mesh, compiled)
+    compiled = _compiled(label, spec)
+    return str(spec.to_xml()), drives
+
+
+def _compiled(label: str, spec: Any) -> Any:
+    """The compiled model.  Raises ModelError: MuJoCo finds an error."""
+    try:
+        with without_warnings():
+            return spec.compile()
+    except (ValueError, mujoco_module().FatalError) as error:
+        raise ModelError(f"{label} cannot be compiled: {' '.join(str(error).split())}") from error
+
+
+def _check_state(label: str, compiled: Any) -> None:
+    """Raise ModelError where the state is more than positions and velocities."""
+    mujoco = mujoco_module()
+    if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + compiled.nq + compiled.nv:
+        names = [compiled.actuator(k).name for k in range(len(compiled.actuator_dyntype)) if compiled.actuator_dyntype[k]]
+        raise ModelError(
+            f"{label} has states besides positions and velocities ({', '.join(names) or 'delays or plugins'}): give "
+            "actuators without dynamics, or actuation="
+        )
+    if not compiled.nv:
+        raise ModelError(f"{label} has no joint: nothing in it moves")
+
+
+def _embed(mesh: Any, compiled: Any) -> None:
+    """Give a mesh that a file describes its vertices and faces in the text."""
+    k = compiled.mesh(mesh.name).id
+    vertices = slice(compiled.mesh_vertadr[k], compiled.mesh_vertadr[k] + compiled.mesh_vertnum[k])
+    faces = slice(compiled.mesh_faceadr[k], compiled.mesh_faceadr[k] + compiled.mesh_facenum[k])
+    turn = np.empty(9)
+    mujoco_module().mju_quat2Mat(turn, compiled.mesh_quat[k])
+    points = compiled.mesh_vert[vertices] @ turn.reshape(3, 3).T + compiled.mesh_pos[k]
+    mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
+    mesh.uservert, mesh.userface = points.ravel(), compiled.mesh_face[faces].ravel()
+    mesh.usernormal, mesh.usertexcoord = [], []
+
+
+# ---------------------------------------------------------------------- drives
+
+
+def _with_drives(label: str, spec: Any, actuation: Actuation) -> Drives:
+    """Replace the actuators of a description, and return the inputs of the new ones."""
+    mujoco = mujoco_module()
+    is_joint = [x for x in spec.actuators if x.trntype == mujoco.mjtTrn.mjTRN_JOINT]
+    driven = {x.target for x in is_joint}
+    for element in [*spec.sensors, *spec.actuators]:
+        if element in list(spec.actuators) or element.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR:
+            spec.delete(element)
+    for key in spec.keys:
+        key.ctrl = []
+    moved = [x for x in spec.joints if int(x.type) > _BALL and (not driven or x.name in driven)]
+    if not moved:
+        raise ModelError(f"{label}: no hinge or slide has a drive; leave actuation out")
+    inputs = dict[str, str]()
+    for joint in moved:
+        name = identifier(joint.name)
+        is_slide = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+        units = ("m", "N") if is_slide else ("rad", "N m")
+        limit = actuation.largest_force(name)
+        if np.isfinite(limit):
+            joint.actfrclimited, joint.actfrcrange = True, [-limit, limit]
+        own = actuation.inputs(name, units)
+        for column, (gain, bias) in zip(own, _gains(label, actuation, name), strict=True):
+            new = spec.add_actuator(name=column, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            new.gainprm[0], new.biastype = gain, mujoco.mjtBias.mjBIAS_AFFINE
+            new.biasprm[1:3] = bias
+        inputs |= own
+    return Drives(inputs)
+
+
+def _gains(label: str, actuation: Actuation, joint: str) -> list[tuple[float, tuple[float, float]]]:
+    """Gain and bias (of position, of velocity) of MuJoCo's actuators for each input of a joint's drive."""
+    if isinstance(actuation, JointTorques):
+        return [(1.0, (0.0, 0.0))]
+    if isinstance(actuation, MotorCurrents):
+        return [(actuation.force_per_current(joint), (0.0, 0.0))]
+    if not isinstance(actuation, PositionControl):
+        raise ModelError(
+            f"{label}: actuation is {actuation!r:.60}; give dr.JointTorques, dr.PositionControl or dr.MotorCurrents"
+        )
+    kp, kd = actuation.gains(joint)
+    found = [(kp, (-kp, 0.0 if actuation.velocity else -kd))]
+    found += [(kd, (0.0, -kd))] if actuation.velocity else []
+    return [*found, (1.0, (0.0, 0.0))] if actuation.feedforward else found
+
+
+def file_drives(compiled: Any, taken: Collection[str]) -> Drives:
+    """Inputs of the actuators of the file, named after them; one that another signal has is ``<name>_ctrl``."""
+    inputs = dict[str, str]()
+    for k in range(len(compiled.actuator_trntype)):
+        name = identifier(compiled.actuator(k).name or f"actuator_{k}")
+        n = int(compiled.actuator_ctrlnum[k]) if hasattr(compiled, "actuator_ctrlnum") else 1
+        name = f"{name}_ctrl" if name in taken else name
+        inputs |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
+    return Drives(inputs)
+
+
+# ---------------------------------------------------------------------- names
+
+
+def joint_columns(compiled: Any) -> Iterator[JointColumns]:
+    """Coordinates, velocities and accelerations of each joint, in MuJoCo's order."""
+    for k in range(compiled.njnt):
+        kind, joint = int(compiled.jnt_type[k]), compiled.joint(k)
+        if kind == _FREE:
+            name = identifier(joint.name or compiled.body(compiled.jnt_bodyid[k]).name or f"base_{k}")
+            position = {f"{name}_{x}": "m" for x in "xyz"} | {f"{name}_q{x}": "1" for x in "wxyz"}
+            velocity = {f"{name}_v{x}": "m/s" for x in "xyz"} | {f"{name}_w{x}": "rad/s" for x in "xyz"}
+        elif kind == _BALL:
+            name = identifier(joint.name or f"joint_{k}")
+            position = {f"{name}_q{x}": "1" for x in "wxyz"}
+            velocity = {f"{name}_w{x}": "rad/s" for x in "xyz"}
+        else:
+            name = identifier(joint.name or f"joint_{k}")
+            unit = "m" if kind == 2 else "rad"
+            position, velocity = {name: unit}, {f"{name}_dot": f"{unit}/s"}
+            yield JointColumns(name, position, velocity, (f"{name}_ddot",))
+            continue
+        yield JointColumns(name, position, velocity, tuple(f"{x}_dot" for x in velocity))
+
+
+_UNITS = {
+    "ACCELEROMETER": "m/s^2", "GYRO": "rad/s", "VELOCIMETER": "m/s", "FORCE": "N", "TORQUE": "N m", "TOUCH": "N",
+    "RANGEFINDER": "m", "TENDONPOS": "m", "TENDONVEL": "m/s", "BALLANGVEL": "rad/s", "FRAMEPOS": "m",
+    "FRAMELINVEL": "m/s", "FRAMEANGVEL": "rad/s", "FRAMELINACC": "m/s^2", "FRAMEANGACC": "rad/s^2",
+    "SUBTREECOM": "m", "SUBTREELINVEL": "m/s",
+}  # fmt: skip
+
+
+def sensor_columns(compiled: Any, states: Collection[str]) -> Iterator[SensorColumns]:
+    """Readings of the sensors of the file; without positions and velocities of joints, which are states.
+
+    A reading that is named as a state is ``<name>_sensor``.
+    """
+    kinds = mujoco_module().mjtSensor
+    of_states = {kinds.mjSENS_JOINTPOS, kinds.mjSENS_JOINTVEL, kinds.mjSENS_CLOCK}
+    for k in range(compiled.nsensor):
+        kind = kinds(int(compiled.sensor_type[k]))
+        if kind in of_states or int(compiled.sensor_datatype[k]) == 4:  # numbers of other kinds, of a user
+            continue
+        name, size = identifier(compiled.sensor(k).name or f"sensor_{k}"), int(compiled.sensor_dim[k])
+        name = f"{name}_sensor" if name in states else name
+        ends = {1: [""], 3: ["_x", "_y", "_z"], 4: ["_qw", "_qx", "_qy", "_qz"]}.get(size, [f"_{i}" for i in range(size)])
+        unit = _UNITS.get(kind.name.removeprefix("mjSENS_"), "1")
+        of_forces = int(compiled.sensor_needstage[k]) == 3
+        yield SensorColumns(name, tuple(name + x for x in ends), unit, int(compiled.sensor_adr[k]), of_forces)
