@@ -80,6 +80,14 @@ class RobotOptions:
     base: Annotated[
         str | None, _option("--base", metavar="held|measured", help="A floating base: held, or with a measured motion.")
     ] = None
+    simulator: Annotated[
+        str | None,
+        _option(
+            "--simulator",
+            metavar="mujoco",
+            help="Contacts, loops, tendons; --unknown KIND/NAME.FIELD,...",
+        ),
+    ] = None
 
     def load(self, model: str) -> Model:
         """The model that ``--model`` names.
@@ -87,9 +95,11 @@ class RobotOptions:
         Raises typer.BadParameter: options for a robot belong to no other model; ModelError: as `load_model`.
         """
         if is_description(model):
-            from diransac.model.library import robot
+            from diransac.model.library import mujoco, robot
 
-            return robot(model, **self._arguments())
+            if self.simulator is None:
+                return robot(model, **self._arguments())
+            return mujoco(model, unknown=self._masks(), actuation=self._actuation())
         for given in (x.name for x in fields(self) if getattr(self, x.name) is not None):
             raise typer.BadParameter(f"--{given} is for the description of a robot (.xml, .urdf)")
         return load_model(model)
@@ -97,7 +107,7 @@ class RobotOptions:
     def load_limbs(self, model: str) -> dict[str, Model]:
         """Models of a robot's limbs by name; of another model, itself under an empty name."""
         whole = self.load(model)
-        limbs = independent_parts(whole) if is_description(model) else {}
+        limbs = independent_parts(whole) if is_description(model) and whole.has_equations else {}
         return limbs if len(limbs) > 1 else {"": whole}
 
     def load_unsaturated(self, model: str) -> UnsaturatedRobot:
@@ -121,6 +131,20 @@ class RobotOptions:
         position = partial(body_position, model, **chosen)
         limits, limbs = robot_limits(model, actuation=given, **chosen), independent_parts(whole)
         return UnsaturatedRobot(limbs if len(limbs) > 1 else {"": whole}, limits, drives, bodies, position)
+
+    def _masks(self) -> Sequence[str]:
+        """Masks of what is unknown in a file that MuJoCo simulates.
+
+        Raises typer.BadParameter: there are none, options belong to equations, or the simulator is unknown.
+        """
+        if self.simulator != "mujoco":
+            raise typer.BadParameter(f"--simulator {self.simulator} is unknown; there is mujoco")
+        for name in ("bodies", "joints", "base"):
+            if getattr(self, name) is not None:
+                raise typer.BadParameter(f"--{name} belongs to equations; with --simulator, name it in --unknown")
+        if self.unknown is None:
+            raise typer.BadParameter('--simulator mujoco needs --unknown "body/trunk.mass,joint/*.damping"')
+        return names(self.unknown)
 
     def _arguments(self) -> dict[str, Any]:
         found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}

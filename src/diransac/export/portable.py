@@ -68,8 +68,8 @@ class PortableModel:
     def of_sensors(self) -> tuple[str, ...]:
         """Parameters of sensors alone, on which the motion does not depend."""
         model = self.model
-        if not model.sensors:
-            return ()
+        if not model.sensors or not model.has_equations:
+            return tuple(model.sensor_parameters)
         x, u, p = ca.SX.sym("x", len(model.state)), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.n_p)
         depends = ca.which_depends(model.dynamics(x, u, p)[0], p, 1, False)
         return tuple(n for n, used in zip(model.parameters, depends, strict=True) if not used)

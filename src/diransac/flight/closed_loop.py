@@ -12,7 +12,7 @@ from diransac.arrays import FloatArray
 from diransac.data.log import Log
 from diransac.errors import SettingsError
 from diransac.model.plant import ModelWithParameters, Plant, as_plant
-from diransac.simulation import LinearFeedback, RolloutBatch, Rollouts, default_threads, rollouts
+from diransac.simulation import LinearFeedback, RolloutBatch, Simulator, default_threads, rollouts
 
 if TYPE_CHECKING:
     from diransac.flight.trajectory import Trajectory
@@ -205,7 +205,7 @@ def _start(plant: Plant, trajectory: Trajectory, changes: Mapping[str, float]) -
     return start
 
 
-def _engine(plants: Sequence[Plant], substeps: int) -> Rollouts:
+def _engine(plants: Sequence[Plant], substeps: int) -> Simulator:
     """Rollouts of the equations that all plants share."""
     different = {id(plant): plant for plant in plants}.values()
     engines = {rollouts(plant.simulated, substeps=substeps) for plant in different}

@@ -27,7 +27,6 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.lacking_terms import with_terms
 from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
-from diransac.model.mjcf import MujocoModel
 from diransac.process import single_threaded
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
@@ -208,7 +207,7 @@ def checked_hold(name: object) -> str | None:
 
 
 def _check_arguments(model: object, seed: object) -> None:
-    if not isinstance(model, Model | MujocoModel):
+    if not isinstance(model, Model):
         raise SettingsError(f"model is {model!r}; give a dr.Model, such as dr.models.planar_rotorcraft()")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
         raise SettingsError(f"seed is {seed!r}; give a whole number")

@@ -107,7 +107,7 @@ def from_data(data: object, make: Callable[..., Result]) -> Result:
 def _checked(data: Mapping[str, Any], make: Callable[..., Result]) -> Result:
     """Result from data of the latest format.  Raises ValueError and others: names, figures or sizes do not fit."""
     data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
-    model, plain = Model.from_dict(data["model"]), load(_Provenance, data)
+    model, plain = _model(data["model"]), load(_Provenance, data)
     estimate, evaluation = load(Estimate, data), load(Evaluation, data)
     layout = ParameterLayout(model.parameters, len(plain.logs))
     if tuple(estimate.parameters) != layout.names or not np.isfinite(estimate.values).all():
@@ -131,6 +131,15 @@ def _checked(data: Mapping[str, Any], make: Callable[..., Result]) -> Result:
     found = make(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
     _derived(found), str(found)  # fail where names and figures do not fit together
     return found
+
+
+def _model(data: Mapping[str, Any]) -> Model:
+    """The stored model, with equations or of a simulator."""
+    if "simulator" not in data:
+        return Model.from_dict(data)
+    from diransac.model.mjcf import MujocoModel
+
+    return MujocoModel.from_dict(data)
 
 
 def _check_resolution(resolution: Resolution, n_u: int) -> None:
@@ -181,13 +190,22 @@ def export(
 
 def _write_description(result: Result, path: str | Path, into: str | Path) -> tuple[str, ...]:
     """Write a description; return the parameters that are not in it."""
-    from diransac.model.robots.calibration import calibrated
-
     found = result.parameters.items()
     values = np.array([np.nan if name in result.unidentifiable else x for name, x in found])
-    text, left_out = calibrated(into, result.model.parameters, values, result.covariance)
+    text, left_out = _calibrated(result, into, values)
     write(path, text)
     return left_out
+
+
+def _calibrated(result: Result, into: str | Path, values: FloatArray) -> tuple[str, tuple[str, ...]]:
+    """Text of a description with values in it, and the parameters that are not."""
+    from diransac.model.mjcf import MujocoModel, calibrated_text
+    from diransac.model.robots.calibration import calibrated
+
+    model = result.model
+    if isinstance(model, MujocoModel):
+        return calibrated_text(into, model, dict(zip(model.parameters, values.tolist(), strict=True)))
+    return calibrated(into, model.parameters, values, result.covariance)
 
 
 def _portable(result: Result, name: str | None = None) -> PortableModel:

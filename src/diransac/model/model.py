@@ -23,7 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, ResultError
 from diransac.model import derivation, expressions
 from diransac.model.derivation import Probe, Symbols
@@ -425,6 +425,13 @@ class Model(Signals):
                 texts += [*parts, *(f"{x} = {y}" for x, y in zip(left, elements, strict=True))]
                 n_parts += len(parts)
         return tuple(texts)
+
+    @property
+    def home(self) -> FloatArray:
+        """State ``(n_x,)`` in which the machine begins if nothing else is known: zero, quaternions (1, 0, 0, 0)."""
+        state = np.zeros(len(self.state))
+        state[[four[0] for four in self.quaternions]] = 1.0
+        return state
 
     # ------------------------------------------------------------------ identity and storage
 

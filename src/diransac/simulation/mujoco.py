@@ -1,7 +1,8 @@
 """Rollouts by MuJoCo: the simulator of a `MujocoModel`.
 
-All lanes of a call are rollouts of `mujoco.rollout` on all threads.  Derivatives are differences, for which each lane is
-simulated again with every unknown moved: states lane by lane, parameters in copies of MuJoCo's model; readings are shifted by biases.  A row takes as many of MuJoCo's steps as its time step goes into it.
+All lanes of a call are rollouts of `mujoco.rollout` on all threads.  Derivatives are differences, for which each lane
+is simulated again with every unknown moved: states lane by lane, parameters in copies of MuJoCo's model; readings are
+shifted by biases.  A row takes as many of MuJoCo's steps as its time step goes into it.
 """
 
 from __future__ import annotations
@@ -70,9 +71,10 @@ class MujocoRollouts(Simulator):
         threads: int = 1,
     ) -> ScoreBatch:
         """Sums of squared errors and inliers of every lane; see `Simulator.score`."""
-        errors = self.errors(batch, measurements, threads=threads)
+        counted = np.where(measurements.valid[:, None], measurements.values, 0.0)
+        errors = self.errors(batch, Measurements(counted, measurements.valid), threads=threads)
         valid = measurements.valid[self._rows(batch)]
-        diverged = ~np.isfinite(errors).all(axis=(1, 2))
+        diverged: BoolArray = np.asarray(~np.isfinite(errors).all(axis=(1, 2)))
         squares = np.where(valid[:, :, None], np.square(errors), 0.0).sum(axis=1)
         squares[diverged] = np.inf
         inliers = inlier_mask(errors, valid, thresholds, min_inlier_signals)
@@ -177,7 +179,9 @@ class MujocoRollouts(Simulator):
         known = (*self._model.parameters, *self._model.state)
         names = known if unknowns is None else tuple(unknowns)
         if not names or len(set(names)) < len(names) or not set(names) <= set(known):
-            raise SettingsError(f"unknowns are {', '.join(names) or 'none'}; choose from {', '.join(known)}, each once.")
+            raise SettingsError(
+                f"unknowns are {', '.join(names) or 'none'}; choose from {', '.join(known)}, each once."
+            )
         return names
 
     def _rows(self, batch: RolloutBatch) -> IntArray:
@@ -185,9 +189,7 @@ class MujocoRollouts(Simulator):
         starts = np.zeros(batch.n_lanes, np.int64) if batch.start_rows is None else batch.start_rows
         return np.asarray(starts[:, None] + np.arange(batch.rows_per_lane))
 
-    def _compared(
-        self, series: FloatArray, batch: RolloutBatch, measurements: Measurements, part: slice
-    ) -> FloatArray:
+    def _compared(self, series: FloatArray, batch: RolloutBatch, measurements: Measurements, part: slice) -> FloatArray:
         """Simulated less measured signals of some lanes; quaternions have the nearer sign."""
         measured = measurements.values[self._rows(batch)[part]]
         simulated = series[..., self._columns].copy()

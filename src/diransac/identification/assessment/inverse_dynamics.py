@@ -89,6 +89,8 @@ def predicted_forces(
     dataset: Dataset, parameters: Sequence[Mapping[str, float]], resolution: Resolution
 ) -> list[PredictedForces]:
     """Forces of the inputs, and as inverse dynamics predict them, of each log; arguments as `force_errors`."""
+    if not dataset.model.has_equations:
+        return []
     try:
         intervals, motion, _ = prepared(LoDiransac(), dataset)
     except LogError:

@@ -6,11 +6,12 @@ bounds of a `Model`, but no equations: identification asks its simulator alone. 
 | file | contents |
 |---|---|
 | `model.py` | `mujoco`, and `MujocoModel` |
-| `description.py` | the file as MuJoCo compiles it, without what only is looked at; names of joints, actuators, sensors |
+| `description.py` | the file as MuJoCo compiles it, without what is only looked at; names of its signals |
 | `masks.py` | unknown parameters by mask: places in MuJoCo's compiled model |
 | `calibration.py` | estimates in the text of the file |
 """
 
+from diransac.model.mjcf.calibration import calibrated_text
 from diransac.model.mjcf.model import MujocoModel, mujoco
 
-__all__ = ["MujocoModel", "mujoco"]
+__all__ = ["MujocoModel", "calibrated_text", "mujoco"]

@@ -128,7 +128,9 @@ def _check_state(label: str, compiled: Any) -> None:
     """Raise ModelError where the state is more than positions and velocities."""
     mujoco = mujoco_module()
     if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + compiled.nq + compiled.nv:
-        names = [compiled.actuator(k).name for k in range(len(compiled.actuator_dyntype)) if compiled.actuator_dyntype[k]]
+        names = [
+            compiled.actuator(k).name for k in range(len(compiled.actuator_dyntype)) if compiled.actuator_dyntype[k]
+        ]
         raise ModelError(
             f"{label} has states besides positions and velocities ({', '.join(names) or 'delays or plugins'}): give "
             "actuators without dynamics, or actuation="
@@ -242,6 +244,9 @@ _UNITS = {
 }  # fmt: skip
 
 
+_ENDS = {1: [""], 3: ["_x", "_y", "_z"], 4: ["_qw", "_qx", "_qy", "_qz"]}
+
+
 def sensor_columns(compiled: Any, states: Collection[str]) -> Iterator[SensorColumns]:
     """Readings of the sensors of the file; without positions and velocities of joints, which are states.
 
@@ -255,7 +260,9 @@ def sensor_columns(compiled: Any, states: Collection[str]) -> Iterator[SensorCol
             continue
         name, size = identifier(compiled.sensor(k).name or f"sensor_{k}"), int(compiled.sensor_dim[k])
         name = f"{name}_sensor" if name in states else name
-        ends = {1: [""], 3: ["_x", "_y", "_z"], 4: ["_qw", "_qx", "_qy", "_qz"]}.get(size, [f"_{i}" for i in range(size)])
+        ends = {1: [""], 3: ["_x", "_y", "_z"], 4: ["_qw", "_qx", "_qy", "_qz"]}.get(
+            size, [f"_{i}" for i in range(size)]
+        )
         unit = _UNITS.get(kind.name.removeprefix("mjSENS_"), "1")
         of_forces = int(compiled.sensor_needstage[k]) == 3
         yield SensorColumns(name, tuple(name + x for x in ends), unit, int(compiled.sensor_adr[k]), of_forces)

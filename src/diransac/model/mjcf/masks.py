@@ -177,7 +177,7 @@ def unknowns_of(
 
 def _of_mask(label: str, compiled: Any, sensors: Collection[SensorColumns], mask: str) -> Iterator[Unknown]:
     """Parameters of one mask."""
-    parts = _MASK.fullmatch(mask) if isinstance(mask, str) else None
+    parts = _MASK.fullmatch(str(mask))
     if parts is None:
         raise ModelError(f'{label}: unknown names {mask!r:.60}; give masks such as "body/trunk.mass"')
     kind, pattern, each = parts["kind"], parts["name"], parts["each"] is not None
@@ -193,7 +193,9 @@ def _of_mask(label: str, compiled: Any, sensors: Collection[SensorColumns], mask
     own = [k for k in range(len(names)) if _rows(compiled, kind, array, k)]
     matches = [k for k in own if fnmatchcase(names[k], pattern)]
     if not matches:
-        raise ModelError(f'{label}: "{mask}" matches nothing; {kind} names are {_listed([names[k] for k in own]) or "none"}')
+        raise ModelError(
+            f'{label}: "{mask}" matches nothing; {kind} names are {_listed([names[k] for k in own]) or "none"}'
+        )
     index = None if parts["index"] is None else int(parts["index"])
     if index is not None and index >= field.size:
         raise ModelError(f'{label}: "{mask}" has the index {index}, but {parts["field"]} has {field.size} entries')
@@ -214,13 +216,15 @@ def _unknown(compiled: Any, named: tuple[str, str], field: Field, group: list[in
                 at = (row,) if values.ndim == 1 else (row, column + entry)
                 places.append(Place(array, at, factor))
     first = places[0]
-    value = float(np.median([getattr(compiled, x.array)[x.index] / x.factor for x in places if x.factor == first.factor]))
+    value = float(
+        np.median([getattr(compiled, x.array)[x.index] / x.factor for x in places if x.factor == first.factor])
+    )
     slides = kind == "joint" and all(compiled.jnt_type[k] == 2 for k in group)
     unit = field.of_slide if slides and field.of_slide else field.unit
     nominal = None if field.sign == "positive" and value <= 0.0 else value
     bounds = {"lower": 0.0} if field.sign == "non-negative" else {"positive": True} if field.sign == "positive" else {}
     elements = tuple((kind, _names(compiled, kind)[k]) for k in group)
-    return Unknown(name, Parameter(unit, value=nominal, **bounds), tuple(places), elements)  # type: ignore[arg-type]
+    return Unknown(name, Parameter(unit, value=nominal, **bounds), tuple(places), elements)
 
 
 def _rows(compiled: Any, kind: str, array: str, k: int) -> list[int]:

@@ -15,11 +15,11 @@ from diransac.arrays import FloatArray
 from diransac.errors import ModelError, ResultError
 from diransac.model.mjcf.description import compiled_text, file_drives, joint_columns, sensor_columns
 from diransac.model.mjcf.masks import ARRAYS, Place, Unknown, unknowns_of
+from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.robots.description import mujoco_module, without_warnings
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text
-from diransac.model.signals import Signals
 
 if TYPE_CHECKING:
     from diransac.model.mjcf.description import JointColumns, SensorColumns
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SIMULATOR", "MujocoModel", "mujoco"]
 
+_OF_EQUATIONS = ("residual", "measurement", "_probe", "_mass_matrix", "_bias", "_definite", "_equations_data")
 SIMULATOR = "mujoco"
 """What marks a stored model as one of this kind."""
 
@@ -85,11 +86,11 @@ def mujoco(
     return MujocoModel(name or identifier(Path(path).stem), text, unknowns, inputs)
 
 
-class MujocoModel(Signals):
+class MujocoModel(Model):
     """A machine that MuJoCo simulates; made by `mujoco`.
 
-    It has the names, units and bounds of a `Model`, but no equations: what needs these (regression, candidate terms,
-    export of code) is not for it.
+    It has the names, units and bounds of a model, but no equations: what needs these (regression, candidate terms,
+    planning, export of code) raises ModelError.
 
     Parameters
     ----------
@@ -106,8 +107,6 @@ class MujocoModel(Signals):
     """
 
     has_equations = False
-    measurement = None
-    first_order: dict[str, str]
 
     def __init__(
         self,
@@ -130,10 +129,8 @@ class MujocoModel(Signals):
         readings = {n: x.unit for x in self._sensors for n in x.columns if sensors is None or n in sensors}
         parameters = {x.name: x.parameter for x in self.unknowns}
         taken = {n: unit for n, unit in readings.items() if n not in inputs}
-        self.kinematics = None if derived else self._coordinate_rates  # type: ignore[assignment]
-        self._name_signals(
-            name, coordinates, inputs, parameters, None if derived else velocities, {}, "", taken
-        )
+        self.kinematics = None if derived else self._rates_of_coordinates  # type: ignore[assignment]
+        self._name_signals(name, coordinates, inputs, parameters, None if derived else velocities, {}, "", taken)
         units = {n: _derivative(unit) for n, unit in self.velocities.items()}
         names = [n for x in joints for n in x.accelerations]
         self.accelerations = dict(zip(names, units.values(), strict=True))
@@ -190,7 +187,7 @@ class MujocoModel(Signals):
         pose = compiled.key_qpos[0] if compiled.nkey else compiled.qpos0
         return np.concatenate([pose, np.zeros(compiled.nv)])
 
-    def _coordinate_rates(self, q: FloatArray, v: FloatArray) -> FloatArray:
+    def _rates_of_coordinates(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Derivatives of the coordinates ``(n_q, n)`` at some states, by MuJoCo's integration of positions."""
         module, step = mujoco_module(), 1e-6
         rates = np.empty((self.n_q, np.asarray(q).shape[1]))
@@ -203,10 +200,31 @@ class MujocoModel(Signals):
 
     # ------------------------------------------------------------------ what identification asks of a model
 
-    nonlinear_parameters = property(lambda self: tuple(self.parameters))
-    is_affine = property(lambda _self: False)
-    affine_sensors: tuple[str, ...] = ()
-    required_signals = property(lambda self: tuple(self.inputs))
+    def __getattr__(self, name: str) -> Any:
+        """Raises ModelError where equations are asked for."""
+        if name in _OF_EQUATIONS:
+            raise ModelError(f"{self._label} has no equations, which this needs: MuJoCo simulates it")
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+    @cached_property
+    def nonlinear_parameters(self) -> tuple[str, ...]:
+        """All parameters: nothing is known to be linear."""
+        return tuple(self.parameters)
+
+    @property
+    def is_affine(self) -> bool:
+        """False."""
+        return False
+
+    @cached_property
+    def affine_sensors(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    @cached_property
+    def required_signals(self) -> tuple[str, ...]:
+        """The inputs."""
+        return tuple(self.inputs)
 
     @cached_property
     def quaternions(self) -> tuple[tuple[int, int, int, int], ...]:
@@ -225,12 +243,12 @@ class MujocoModel(Signals):
             found[name] = (*self.state, *more, *((own[name],) if name in own else ()))
         return found
 
-    @property
+    @cached_property
     def sensor_parameters(self) -> tuple[str, ...]:
         """Parameters that only sensors depend on."""
         return tuple(x.name for x in self.unknowns if x.columns)
 
-    @property
+    @cached_property
     def biased_sensors(self) -> tuple[str, ...]:
         """Sensors with a bias among the parameters."""
         return tuple(c for x in self.unknowns for c in x.columns)
@@ -264,22 +282,10 @@ class MujocoModel(Signals):
     def _other(self, **changes: Any) -> MujocoModel:
         kept = {"unknowns": self.unknowns, "constants": self.constants, "sensors": self._given_sensors}
         kept |= changes
-        return MujocoModel(self.name, self.text, kept.pop("unknowns"), self.inputs, **kept)
+        unknowns: Any = kept.pop("unknowns")
+        return MujocoModel(self.name, self.text, unknowns, self.inputs, **kept)  # type: ignore[arg-type]  # by name
 
     # ------------------------------------------------------------------ identity and storage
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """SHA-256 of the text, names and bounds."""
-        return str(self.to_dict()["checksum"])
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, MujocoModel):
-            return NotImplemented
-        return self is other or self.fingerprint == other.fingerprint
-
-    def __hash__(self) -> int:
-        return hash(self.fingerprint)
 
     def to_dict(self) -> dict[str, Any]:
         """Text, parameters and names as JSON data, which `from_dict` reads."""

@@ -18,7 +18,7 @@ from diransac.model.robots.consistency import consistent_parameters, inconsisten
 from diransac.model.robots.description import Description, Joint, read_description
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 
-__all__ = ["calibrated", "impossible_changes"]
+__all__ = ["Document", "calibrated", "impossible_changes"]
 
 _MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
 
@@ -57,7 +57,7 @@ def calibrated(
     description = read_description(path, "held")
     source = Path(path).read_bytes()
     found = _estimates(description, parameters, values, covariance)
-    document = _Document(source, f'robot description "{path}"')
+    document = Document(source, f'robot description "{path}"')
     # Attributes of a joint, and of a URDF joint's dynamics, by parameter.
     attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else _MJCF
     for name, of_joint in found.joints.items():
@@ -184,7 +184,7 @@ def _combinations(places: list[dict[str, float]]) -> tuple[list[str], list[str],
 
 
 @dataclass
-class _Element:
+class Element:
     """Place of an element in the text, in bytes: of its start tag, and of the element."""
 
     tag: str
@@ -192,10 +192,10 @@ class _Element:
     begin: int
     inside: int
     end: int
-    children: list[_Element]
+    children: list[Element]
 
 
-class _Document:
+class Document:
     """Text of a description, in which elements are replaced."""
 
     def __init__(self, source: bytes, label: str) -> None:
@@ -214,21 +214,21 @@ class _Document:
 
     def set_joint(self, joint: Joint, values: Mapping[str, float]) -> None:
         """Give a joint these attributes; those of a URDF belong to its dynamics."""
-        element = self._named("joint", joint.name)
+        element = self.named("joint", joint.name)
         texts = {key: repr(value) for key, value in values.items()}
         for key, polynomial in (("damping", joint.damping), ("stiffness", joint.stiffness)):
             if key in texts and len(polynomial) > 1:
                 texts[key] = " ".join([texts[key], *map(repr, polynomial[1:])])
         if not self.is_urdf:
-            self._rewrite(element, texts)
+            self.rewrite(element, texts)
         elif dynamics := [x for x in element.children if x.tag == "dynamics"]:
-            self._rewrite(dynamics[0], texts)
+            self.rewrite(dynamics[0], texts)
         elif texts:
-            self._insert(element, f"<dynamics {_attributes(texts)}/>")
+            self.insert(element, f"<dynamics {_attributes(texts)}/>")
 
     def set_body(self, name: str, inertial: FloatArray) -> None:
         """Give a body these inertial parameters about the origin of its frame."""
-        element = self._named("link" if self.is_urdf else "body", name)
+        element = self.named("link" if self.is_urdf else "body", name)
         mass, h = inertial[0], inertial[1:4]
         centre = h / mass
         shift = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
@@ -237,19 +237,20 @@ class _Document:
         if old := [x for x in element.children if x.tag == "inertial"]:
             self.changes[old[0].begin, old[0].end] = new
         else:
-            self._insert(element, new)
+            self.insert(element, new)
 
-    def _named(self, tag: str, name: str) -> _Element:
-        """The body, link or joint of that name.  Raises ModelError: it is in another file."""
-        parents = [self.root] if self.is_urdf else [x for x in self.root.children if x.tag == "worldbody"]
+    def named(self, tag: str, name: str, section: str = "worldbody") -> Element:
+        """The body, link or joint of a name, or any element of another section.  Raises ModelError: there is none."""
+        parents = [self.root] if self.is_urdf else [x for x in self.root.children if x.tag == section]
         for element in (x for parent in parents for x in _below(parent)):
-            if element.tag == tag and element.attributes.get("name") == name:
+            fits = section != "worldbody" or element.tag == tag
+            if fits and element.attributes.get("name") == name:
                 return element
         raise ModelError(
             f'{self.label}: {tag} "{name}" is not in this file by name; write the files that it includes into one'
         )
 
-    def _rewrite(self, element: _Element, texts: Mapping[str, str]) -> None:
+    def rewrite(self, element: Element, texts: Mapping[str, str]) -> None:
         """Replace or add attributes in a start tag."""
         place = element.begin, element.inside
         tag = self.changes.get(place, self.source[slice(*place)].decode())
@@ -259,7 +260,7 @@ class _Document:
                 tag = re.sub(r"\s*(/?>)$", rf' {key}="{text}"\g<1>', tag)
         self.changes[place] = tag
 
-    def _insert(self, element: _Element, new: str) -> None:
+    def insert(self, element: Element, new: str) -> None:
         """Add a first child."""
         start = self.source[element.begin : element.inside].decode()
         if start.endswith("/>"):
@@ -270,14 +271,14 @@ class _Document:
             self.changes[place] = self.changes.get(place, "") + new
 
 
-def _elements(source: bytes) -> _Element:
+def _elements(source: bytes) -> Element:
     """The root element, with all below it."""
-    parser, open_elements, roots = expat.ParserCreate(), list[_Element](), list[_Element]()
+    parser, open_elements, roots = expat.ParserCreate(), list[Element](), list[Element]()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         begin = parser.CurrentByteIndex
         inside = _end_of_tag(source, begin)
-        element = _Element(tag, attributes, begin, inside, inside, [])
+        element = Element(tag, attributes, begin, inside, inside, [])
         (open_elements[-1].children if open_elements else roots).append(element)
         open_elements.append(element)
 
@@ -298,7 +299,7 @@ def _end_of_tag(source: bytes, begin: int) -> int:
     return match.end()
 
 
-def _below(element: _Element) -> Iterator[_Element]:
+def _below(element: Element) -> Iterator[Element]:
     """Elements below one, in order."""
     for child in element.children:
         yield child

@@ -31,12 +31,12 @@ from diransac.identification.methods.lo_diransac.projection import ProjectedEsti
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
     unmeasured_states,
 )
+from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.refusal import check_signs
 from diransac.identification.structure.structural import check_structure, unidentifiable

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import acting_inputs
 from diransac.identification.methods.lo_diransac.mixture import Mixture
 from diransac.simulation import LinearizedErrors, Measurements, RolloutBatch, default_threads, rollouts
@@ -51,7 +51,8 @@ _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
 _PASSES, _CONVERGED, _SETTLED, _HALVINGS = 16, 0.3, 0.05, 3
-"""Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; halved steps."""
+"""Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
+are halved."""
 _EARLY, _FIRM = 3, 1e12
 """Passes before a delay is estimated, for which wrong parameters would stand."""
 _WIDE, _NARROW = 0.1, 1e-5
@@ -103,7 +104,7 @@ class Pass:
 
     def step(self, precision: FloatArray, pull: FloatArray) -> FloatArray:
         """Gauss-Newton step ``(n,)`` with priors; 0 in directions of which the logs tell nothing."""
-        return self.covariance(precision) @ (self.scores.sum(axis=0) + pull)
+        return np.asarray(self.covariance(precision) @ (self.scores.sum(axis=0) + pull))
 
     def covariance(self, precision: FloatArray) -> FloatArray:
         """Covariance ``(n, n)`` by the noise; 0 of what the logs tell nothing of."""
@@ -144,7 +145,8 @@ class Predictor:
         n = len(intervals.model.signals)
         spread, noise = np.ones(n), np.ones(n)
         low, high = np.zeros(n), np.ones(n)
-        for j in np.flatnonzero(intervals.known.any(axis=0)):
+        seen: BoolArray = np.asarray(intervals.known.any(axis=0))
+        for j in np.flatnonzero(seen):
             y = intervals.measured[intervals.known[:, j], j]
             low[j], high[j] = y.min(), max(y.max(), y.min() + _TINY)
             spread[j] = _robust(y - np.median(y)) or np.ptp(y) or 1.0
@@ -152,14 +154,13 @@ class Predictor:
             noise[j] = max(_FIRST_NOISE * _robust(bends) / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], _TINY)
         pi = np.full(n, 0.1 if outliers else 0.0)
         floor = np.maximum(1e-2 * _LEAST_NOISE * spread, _TINY)
-        seen = intervals.known.any(axis=0)
         whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
         for four in whole:
             noise[list(four)], floor[list(four)] = noise[list(four)].max(), floor[list(four)].max()
         return cls(intervals, Mixture(noise, pi, high - low, floor, whole), free_delay=free_delay)
 
     @cached_property
-    def columns(self) -> FloatArray:
+    def columns(self) -> IntArray:
         """Signals that the logs have."""
         return np.flatnonzero(self.intervals.sampled.any(axis=0))
 
@@ -194,8 +195,8 @@ class Predictor:
         units = [*model.coordinates.values(), *(x.partition("/")[0] for x in model.velocities.values())]
         unsure = np.array([_UNSURE.get(x, 0.3) for x in units])
         unsure[model.n_q :] *= 10.0
-        seen = self.intervals.known.any(axis=0)[:n_x]
-        return np.where(seen, np.minimum(self.noise.sigma[:n_x] + 0.03 * unsure, unsure), unsure)
+        seen: BoolArray = np.asarray(self.intervals.known.any(axis=0))
+        return np.where(seen[:n_x], np.minimum(self.noise.sigma[:n_x] + 0.03 * unsure, unsure), unsure)
 
     def first_state(self, w: int, rest: FloatArray) -> FloatArray:
         """State at an interval's start: medians of the first samples, of what nothing measures the rest."""
@@ -208,13 +209,13 @@ class Predictor:
 
     def over_logs(self, p: FloatArray) -> Pass:
         """Predictions with parameters ``(n_p,)``."""
-        one, inputs = self.intervals, self.acting(self.delay)
+        one, inputs, home = self.intervals, self.acting(self.delay), self.intervals.model.home
         later = self.acting(self.delay + _DELAY_STEP) if self.free_delay else None
         run = _Run(self, p, inputs, later)
-        state, belief = self.first_state(0, one.model.home), _Belief.begin(self.unsure, run.n)
+        state, belief = self.first_state(0, home), _Belief.begin(self.unsure, run.n)
         for w in range(len(one)):
             if w and not one.following[w]:
-                rest = one.model.home if one.log_of[w] != one.log_of[w - 1] else state
+                rest = home if one.log_of[w] != one.log_of[w - 1] else state
                 state, belief = self.first_state(w, rest), _Belief.begin(self.unsure, run.n)
             state, belief = run.interval(w, state, belief)
         return run.result()
@@ -274,7 +275,8 @@ class _Run:
         if self.later is None:
             return found
         late, end = simulator.errors_and_ends(self.batch(w, state, self.later), measurements, threads=1)
-        assert found.final_states is not None and found.final_slopes is not None
+        assert found.final_states is not None
+        assert found.final_slopes is not None
         of_delay = (late - found.errors) / _DELAY_STEP
         of_end = (end - found.final_states) / _DELAY_STEP
         return replace(
@@ -290,7 +292,8 @@ class _Run:
         rows = slice(int(one.starts[w]), int(one.starts[w]) + one.length)
         known = one.known[rows][:, columns]
         at = self.linearized(w, state)
-        assert at.final_states is not None and at.final_slopes is not None
+        assert at.final_states is not None
+        assert at.final_slopes is not None
         e, J, F = at.errors[0], at.jacobian[0], at.final_slopes[0]
         if not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST):
             self.states[w], self.lost = state, self.lost + 10.0 * float(known.sum())
@@ -311,7 +314,7 @@ class _Run:
     def _tempered(
         self, w: int, state: FloatArray, belief: _Belief, at: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     ) -> tuple[_Update, FloatArray]:
-        """Update by the samples of an interval with as much weight as their linear model deserves, and the end after it.
+        """Update by an interval's samples with as much weight as their linear model deserves, and the end after it.
 
         Where a contact changes, a full step may lead to a motion that agrees less.
         """
@@ -344,9 +347,8 @@ class _Run:
 
     @cached_property
     def _noise(self) -> Mixture:
-        noise, columns = self.predictor.noise, self.predictor.columns
-        arrays = (noise.sigma, noise.pi, noise.span, noise.floor)
-        return Mixture(*(x[columns] for x in arrays))
+        noise, k = self.predictor.noise, self.predictor.columns
+        return Mixture(noise.sigma[k], noise.pi[k], noise.span[k], noise.floor[k])
 
     def _propagated(
         self, w: int, state: FloatArray, update: _Update, at: tuple[FloatArray, FloatArray, FloatArray]
@@ -390,14 +392,15 @@ class _Update:
     @classmethod
     def of(cls, belief: _Belief, samples: tuple[FloatArray, FloatArray, FloatArray]) -> _Update:
         """Update by errors, their derivatives and weights of an interval's samples."""
-        e, J, weights = (x.reshape(-1, *x.shape[2:]) for x in samples)
-        n_x = len(belief.slopes)
+        errors, jacobian, of_samples = samples
+        e, weights, n_x = errors.ravel(), of_samples.ravel(), len(belief.slopes)
+        J: FloatArray = jacobian.reshape(len(e), -1)
         of_x, of_p = J[:, :n_x], J[:, n_x:] + J[:, :n_x] @ belief.slopes
         own, scale = np.diag(belief.covariance), np.sqrt(weights)[:, None]
         root = np.linalg.cholesky(belief.covariance + np.diag(_ROUNDING * own + _TINY**2))
         # Rows of samples, and of what is known beforehand, in units of its root.
         above = np.hstack([scale * of_x @ root, scale * of_p, -scale * e[:, None]])
-        R = np.linalg.qr(np.vstack([above, np.eye(n_x, above.shape[1])]), mode="r")
+        R: FloatArray = np.asarray(np.linalg.qr(np.vstack([above, np.eye(n_x, above.shape[1])]), mode="r"))
         of_state, left = R[:n_x], R[n_x:, n_x:]
         solved = np.linalg.solve(of_state[:, :n_x], np.column_stack([of_state[:, n_x:], np.eye(n_x)]))
         slopes, moved, inverse = np.split(solved, [of_p.shape[1], of_p.shape[1] + 1], axis=1)
@@ -417,7 +420,11 @@ def _robust(values: FloatArray) -> float:
 
 
 def minimised(
-    predictor: Predictor, p: FloatArray, *, outliers: bool, progress: Callable[[int, Predictor, FloatArray, Pass], None] | None = None
+    predictor: Predictor,
+    p: FloatArray,
+    *,
+    outliers: bool,
+    progress: Callable[[int, Predictor, FloatArray, Pass], None] | None = None,
 ) -> tuple[Predictor, FloatArray, Pass, bool]:
     """Parameters with the likeliest predictions, with noise and what the model lacks.
 
@@ -449,7 +456,10 @@ def minimised(
         factor = float(np.sqrt(np.clip(now.surprise, 0.1, 4.0)))
         lacks = max(predictor.lacks * factor, _LEAST_LACKS)
         following = replace(predictor, noise=noise, lacks=lacks, wide=k + 1 < _EARLY)
-        step, errors = now.step(np.append(precision[:-1], _FIRM) if held else precision, pull), np.sqrt(np.diag(now.covariance(precision)).clip(_TINY**2))
+        step, errors = (
+            now.step(np.append(precision[:-1], _FIRM) if held else precision, pull),
+            np.sqrt(np.diag(now.covariance(precision)).clip(_TINY**2)),
+        )
         steady = np.abs(np.log(noise.sigma / predictor.noise.sigma)[predictor.columns]).max() < _SETTLED
         if steady and (np.abs(step) < _CONVERGED * errors).all():
             converged = True
@@ -482,4 +492,3 @@ def _moved(predictor: Predictor, p: FloatArray, step: FloatArray, *, held: bool)
     if held or not predictor.free_delay:
         return then, predictor
     return then, replace(predictor, delay=float(np.clip(predictor.delay + np.clip(step[-1], -1.0, 1.0), -2.0, 50.0)))
-

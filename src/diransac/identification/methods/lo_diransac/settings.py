@@ -95,7 +95,7 @@ class LoDiransacSettings:
         return bool(self.input_delay or self.input_lag)
 
     def start_of(self, layout: ParameterLayout) -> FloatArray | None:
-        """The user's start ``(n,)``, means of priors and nominal values, in this order; one where there is none of these.
+        """The user's start ``(n,)``, means of priors, and nominal values, in this order; one where there is none.
 
         None where there is none of any parameter.
         """

@@ -21,7 +21,6 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.prediction_error import Pass, Predictor, minimised
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
-from diransac.text_table import duration
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -92,8 +91,8 @@ def estimated_by_simulation(
         (predictor, p, now), ended = last[0], TIME_LIMIT
     if now.lost > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
-            f"{dataset.source}: simulations diverge in most of the log from {', '.join(map(str, dataset.layout.names[:3]))}"
-            ", ... as in the file; correct its values, or give start="
+            f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
+            "start= or --start"
         )
     notes = tuple(dict.fromkeys(x for _, _, said in samples for x in said))
     return _Found(settings, dataset, predictor, p, now, ended, notes).estimate()
@@ -114,8 +113,8 @@ class _Found:
     def covariance(self) -> FloatArray:
         """Covariance ``(n, n)``, the delay's last if it is estimated.
 
-        It is increased where scores of neighbouring intervals scatter more than by white noise (Huber 1967, by batches),
-        and by the step that is left.
+        It is increased where scores of neighbouring intervals scatter more than by white noise (Huber 1967, by
+        batches), and by the step that is left.
         """
         layout, none = self.dataset.layout, np.zeros(int(self.predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
@@ -124,7 +123,7 @@ class _Found:
         scatter = np.square(batch_sums(self.last.scores @ white)).sum(axis=0)
         more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + _TINY)))
         left = self.last.step(precision, pull)
-        return white * np.outer(more, more) + np.diag(np.square(left))
+        return np.asarray(white * np.outer(more, more) + np.diag(np.square(left)))
 
     def estimate(self) -> Estimate:
         """The estimate."""
@@ -146,13 +145,14 @@ class _Found:
             resolution=Resolution("rk4", 1, self.predictor.intervals.hold, timing),
             notes=self.notes,
             diagnosis=self._diagnosis(tuple(n for n, x in zip(names, lost, strict=True) if x), delay_error),
-            checks=tuple(self._checks(late)),
+            checks=tuple(self._checks()),
         )
 
     def _delay(self, error: float) -> float:
         """Delay of the inputs, samples; 0 where it is negligible, or not significant."""
         size = abs(self.predictor.delay)
-        return self.predictor.delay if size > max(_LEAST_DELAY, 3.0 * error) or self.settings.input_delay else 0.0
+        late = float(self.predictor.delay)
+        return late if size > max(_LEAST_DELAY, 3.0 * error) or self.settings.input_delay else 0.0
 
     def _lost(self, covariance: FloatArray) -> BoolArray:
         """Parameters ``(n,)`` that the logs do not determine: nothing depends on them, or too little."""
@@ -163,15 +163,14 @@ class _Found:
         has_prior = np.isfinite(self.dataset.layout.prior_std)
         return np.asarray(~has_prior & ~(told & (np.sqrt(np.diag(covariance)[:n]) < _NOTHING_KNOWN * size)))
 
-    def _checks(self, late: float) -> Iterator[Finding]:
+    def _checks(self) -> Iterator[Finding]:
         """Findings on the fit."""
         if self.ended not in ("converged", TIME_LIMIT):
             yield Finding(
-                "care", "Passes over the log did not converge within their limit", "begin closer, with start= or --start"
+                "care",
+                "Passes over the log did not converge within their limit",
+                "begin closer, with start= or --start",
             )
-        if late:
-            text = f"the inputs act {duration(abs(late) * self.dataset.dt)} {'later' if late > 0.0 else 'earlier'} than"
-            yield Finding("note", f"{text[0].upper()}{text[1:]} recorded, which the estimate includes.")
 
     def _diagnosis(self, lost: tuple[str, ...], delay_error: float) -> Diagnosis:
         """Noise, outliers and unmodelled accelerations, by name and over the rows of the given logs."""
@@ -187,7 +186,9 @@ class _Found:
         has = noise.has_outliers
         return Diagnosis(
             noise_std={name: float(noise.sigma[k]) for name, k in columns.items()},
-            outlier_fraction={name: float(noise.pi[k] if has[k] else outliers[:, k].mean()) for name, k in columns.items()},
+            outlier_fraction={
+                name: float(noise.pi[k] if has[k] else outliers[:, k].mean()) for name, k in columns.items()
+            },
             outliers={name: self._on_given_logs(outliers[:, k]) for name, k in columns.items()},
             window_log=window_log,
             unmodelled_time=begins + dt * (place + 0.5 * (one.length - 1)),
