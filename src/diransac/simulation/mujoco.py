@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MujocoRollouts"]
 
-_STEP = 1e-6
-"""Difference of an unknown over its size: of the solver's tolerance (1e-8), a hundredth shows in a derivative."""
+_STEP, _STEP_OF_PARAMETERS = 1e-7, 1e-5
+"""Differences of states, and of parameters over their sizes: wider ones meet contacts that begin a step earlier."""
 _LANES = 4096
 """Rollouts of one call of MuJoCo at most, which stores all their states."""
 _DIVERGED = 1e8
@@ -146,19 +146,15 @@ class MujocoRollouts(Simulator):
         *,
         unknowns: Sequence[str] | None = None,
         threads: int = 1,
-        step: float = _STEP,
     ) -> LinearizedErrors:
-        """Errors and Jacobian row by row, from differences; see `Simulator.linearized_errors`.
-
-        ``step`` is the difference of a parameter over its size.
-        """
+        """Errors and Jacobian row by row, from differences; see `Simulator.linearized_errors`."""
         names, n, n_x = self._unknowns(unknowns), batch.n_lanes, len(self._model.state)
         errors = np.empty((n, batch.rows_per_lane, len(self.signals)))
         jacobian, final = np.empty((*errors.shape, len(names))), np.empty((n, n_x))
         slopes = np.empty((n, n_x, len(names)))
         for part in _parts(n, max(1, _LANES // (len(names) + 1))):
             errors[part], jacobian[part], final[part], slopes[part] = self._linearized(
-                batch, measurements, names, part, threads, step
+                batch, measurements, names, part, threads
             )
         return LinearizedErrors(names, errors, jacobian, final, slopes)
 
@@ -212,7 +208,6 @@ class MujocoRollouts(Simulator):
         names: tuple[str, ...],
         part: slice,
         threads: int,
-        step: float = _STEP,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Errors and their derivatives of some lanes, final states and their derivatives."""
         lanes, n_z = np.arange(batch.n_lanes)[part], len(names)
@@ -223,7 +218,9 @@ class MujocoRollouts(Simulator):
         own, state = list(self._model.parameters), list(self._model.state)
         for k, name in enumerate(names):
             values, column = (p, own.index(name)) if name in own else (x, state.index(name))
-            steps[:, k] = (step if name in own else _STEP) * np.maximum(self._sizes[name], np.abs(values[:, 0, column]))
+            steps[:, k] = (_STEP_OF_PARAMETERS if name in own else _STEP) * np.maximum(
+                self._sizes[name], np.abs(values[:, 0, column])
+            )
             values[:, k + 1, column] += steps[:, k]
         rows = np.repeat(self._rows(batch)[lanes], n_all, axis=0)
         series, ends = self._run(batch, rows, p.reshape(n * n_all, -1), x.reshape(n * n_all, -1), threads)

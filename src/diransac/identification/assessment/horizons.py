@@ -156,7 +156,7 @@ class OpenLoop:
         self.segment: Segment = alone.segments[0]
         self.simulation = Simulation(alone, resolution=resolution)
         self.parameters = dataset.model.parameter_vector(parameters)
-        self.smoothed = _smoothed(alone) if start == "smoothed" else None
+        self.smoothed = _smoothed(alone, self.parameters, resolution) if start == "smoothed" else None
         self.states = _states(self.segment, layout, self.parameters, self.smoothed)
         n_s = self.segment.measured.shape[1]
         found = self.smoothed
@@ -177,6 +177,8 @@ class OpenLoop:
         their starts takes of few samples.
         """
         assert self.smoothed is not None
+        if not self.segment.model.has_equations:
+            return self.smoothed.noise
         stretch = max(self.stretches, key=lambda x: x.stop - x.start)
         # Forty short simulations are enough.
         every = max(1, (stretch.stop - stretch.start) // 40)
@@ -212,7 +214,7 @@ class OpenLoop:
 
     def starts(self, stretch: slice, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Initial states ``(K, n_x)`` of windows from some rows, and their standard deviations ``(K, n_x, n_x)``."""
-        if self.smoothed is None:
+        if self.smoothed is None or not self.segment.model.has_equations:
             found = self.states[rows]
             return found, np.zeros((*found.shape, found.shape[1]))
         one = self._estimated(stretch, rows)
@@ -380,11 +382,12 @@ def _squares_about_mean(measured: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------- states of a log
 
 
-def _smoothed(alone: Dataset) -> SmoothedLog | None:
-    """One log, smoothed without the model; None where it is too short."""
-    from diransac.identification.assessment.window_starts import smoothed_log  # which needs all of lo-diransac
+def _smoothed(alone: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
+    """One log, smoothed without the model, or followed by one without equations; None where it is too short."""
+    # These need all of lo-diransac.
+    from diransac.identification.assessment.window_starts import followed_log, smoothed_log
 
-    return smoothed_log(alone)
+    return smoothed_log(alone) if alone.model.has_equations else followed_log(alone, parameters, resolution)
 
 
 def _states(
@@ -398,6 +401,8 @@ def _states(
     Raises LogError: the log lacks another state on which a measured signal depends.
     """
     model, matter = segment.model, segment.model.states_behind(segment.present)
+    if smoothed is not None and not model.has_equations:
+        return smoothed.signals[:, : len(model.state)]
     hidden = tuple(n for n in model.first_order if n in matter and n not in segment.present)
     derived = () if smoothed is None else derived_velocities(segment, matter)
     given = dict.fromkeys((*hidden, *derived), 0.0)

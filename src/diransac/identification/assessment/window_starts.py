@@ -25,13 +25,15 @@ from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
+from diransac.identification.methods.lo_diransac.without_equations import followed
 from diransac.identification.regression.uncertainty import robust_std
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.diagnosis import Resolution
     from diransac.identification.evaluation.simulation import Simulation
 
-__all__ = ["SmoothedLog", "WindowStarts", "smoothed_log", "window_starts"]
+__all__ = ["SmoothedLog", "WindowStarts", "followed_log", "smoothed_log", "window_starts"]
 
 _STEPS = 20
 """Gauss-Newton steps."""
@@ -93,6 +95,30 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     # Outliers are six standard deviations of the noise from the motion.
     outliers = known & (np.abs(np.where(known, distances, 0.0)) > 6.0 * np.maximum(noise, least))
     return SmoothedLog(signals, noise, outliers, intervals.length, samples)
+
+
+def followed_log(dataset: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
+    """Motion of the only log of a dataset as a model without equations follows it; None where the log is too short.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        With one log.
+    parameters : (n_p,) array
+    resolution : Resolution
+        With the timing of the inputs.
+    """
+    try:
+        found = followed(LoDiransac(), dataset, parameters, resolution)
+    except LogError:
+        return None
+    (one,), model = dataset.segments, dataset.model
+    columns = [model.signals.index(n) for n in one.signals]
+    signals = found.signals[: len(one)].copy()
+    signals[one.gaps] = np.nan
+    samples = np.isfinite(one.measured).mean(axis=0) * found.length
+    outliers = found.outliers[: len(one), columns]
+    return SmoothedLog(signals, found.noise[columns], outliers, found.length, samples)
 
 
 def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:

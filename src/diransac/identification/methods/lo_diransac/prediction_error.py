@@ -22,6 +22,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import acting_inputs
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.mixture import Mixture
 from diransac.simulation import LinearizedErrors, Measurements, RolloutBatch, default_threads, rollouts
 from diransac.time_limit import check_time
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation.mujoco import MujocoRollouts
 
-__all__ = ["Pass", "Predictor", "minimised"]
+__all__ = ["Pass", "Predictor", "minimised", "settled"]
 
 _FIRST = 5
 """Samples of which the median is a first state."""
@@ -50,13 +51,15 @@ _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
 _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
-_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 16, 0.3, 0.05, 3
+_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 20, 0.5, 0.05, 3
 """Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
 are halved."""
-_EARLY, _FIRM = 3, 1e12
-"""Passes before a delay is estimated, for which wrong parameters would stand."""
-_WIDE, _NARROW = 0.1, 1e-5
-"""Differences of parameters, over their sizes."""
+_SETTLING = 4
+"""Passes in which scales settle with parameters that are given."""
+_FASTER = 0.75
+"""Power of the surprise by which what the model lacks shrinks."""
+_EARLY, _REACH = 3, {"m": 0.05, "rad": 0.2}
+"""Passes before a delay is estimated, for which wrong parameters would stand; step of other parameters at most."""
 _DELAY_STEP = 0.5
 """Difference of a delay, samples."""
 
@@ -102,16 +105,50 @@ class Pass:
         own = noise.negative_log_likelihood(self.errors / wide, known) + known * np.log(wide)
         return float(own.sum()) + self.lost
 
-    def step(self, precision: FloatArray, pull: FloatArray) -> FloatArray:
-        """Gauss-Newton step ``(n,)`` with priors; 0 in directions of which the logs tell nothing."""
-        return np.asarray(self.covariance(precision) @ (self.scores.sum(axis=0) + pull))
+    def step(
+        self, precision: FloatArray, pull: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
+    ) -> FloatArray:
+        """Gauss-Newton step ``(n,)`` with priors, within bounds of it; 0 where the logs tell nothing.
+
+        The other parameters follow those that stay at a bound.
+        """
+        information, right = self.information + np.diag(precision), self.scores.sum(axis=0) + pull
+        step, free = np.zeros(len(right)), np.ones(len(right), bool)
+        for _ in range(len(right)):
+            left = right[free] - information[np.ix_(free, ~free)] @ step[~free]
+            step[free] = _inverse(information[np.ix_(free, free)]) @ left
+            if bounds is None:
+                break
+            held = np.clip(step, *bounds)
+            beyond = free & (held != step)
+            if not beyond.any():
+                break
+            worst = np.argmax(np.where(beyond, np.abs(step - held) / (bounds[1] - bounds[0] + _TINY), -1.0))
+            step[worst], free[worst] = held[worst], False
+        return step
 
     def covariance(self, precision: FloatArray) -> FloatArray:
         """Covariance ``(n, n)`` by the noise; 0 of what the logs tell nothing of."""
-        information = self.information + np.diag(precision)
-        d = np.sqrt(np.maximum(np.diag(information), 0.0))
-        scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > _TINY)
-        return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
+        return _inverse(self.information + np.diag(precision))
+
+    def robust_covariance(self, precision: FloatArray) -> FloatArray:
+        """Covariance ``(n, n)``, larger where scores of neighbouring intervals scatter more than by white noise.
+
+        References
+        ----------
+        Huber 1967, by batches.
+        """
+        white = self.covariance(precision)
+        scatter = np.square(batch_sums(self.scores @ white)).sum(axis=0)
+        more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + _TINY**2)))
+        return np.asarray(white * np.outer(more, more))
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Inverse in columns of unit size; 0 of what there is no information about."""
+    d = np.sqrt(np.maximum(np.diag(information), 0.0))
+    scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > _TINY)
+    return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
 
 
 @dataclass(frozen=True)
@@ -128,8 +165,6 @@ class Predictor:
         Of the inputs, samples.
     free_delay : bool
         Whether it is estimated.
-    wide : bool
-        Whether slopes are taken over a tenth of the parameters: rollouts jump where a contact begins a step earlier.
     """
 
     intervals: ShootingIntervals
@@ -137,7 +172,6 @@ class Predictor:
     lacks: float = _LACKS
     delay: float = 0.0
     free_delay: bool = True
-    wide: bool = True
 
     @classmethod
     def of(cls, intervals: ShootingIntervals, *, outliers: bool, free_delay: bool) -> Predictor:
@@ -220,6 +254,14 @@ class Predictor:
             state, belief = run.interval(w, state, belief)
         return run.result()
 
+    def trajectories(self, p: FloatArray, states: FloatArray) -> FloatArray:
+        """All signals ``(N, n_signals)`` of the intervals from states ``(W, n_x)`` at their starts."""
+        one = self.intervals
+        parameters = np.broadcast_to(one.parameters_of(p, one.log_of), (len(one), one.model.n_p))
+        lanes = (one.dt, one.starts, one.length, one.first_of_log)
+        batch = RolloutBatch(parameters, states, self.acting(self.delay), *lanes)
+        return self._simulator.trajectories(batch, threads=one.threads).reshape(len(one.measured), -1)
+
 
 @dataclass(frozen=True)
 class _Belief:
@@ -270,7 +312,6 @@ class _Run:
             measurements,
             unknowns=names,
             threads=self.threads,
-            step=_WIDE if predictor.wide else _NARROW,
         )
         if self.later is None:
             return found
@@ -452,27 +493,45 @@ def minimised(
         none = np.zeros(int(predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
         pull = precision * np.concatenate([layout.prior_mean - p, none])
-        noise = _noise_after(predictor, now, outliers=outliers)
-        factor = float(np.sqrt(np.clip(now.surprise, 0.1, 4.0)))
-        lacks = max(predictor.lacks * factor, _LEAST_LACKS)
-        following = replace(predictor, noise=noise, lacks=lacks, wide=k + 1 < _EARLY)
-        step, errors = (
-            now.step(np.append(precision[:-1], _FIRM) if held else precision, pull),
-            np.sqrt(np.diag(now.covariance(precision)).clip(_TINY**2)),
-        )
+        following = _with_scales(predictor, now, outliers=outliers)
+        noise = following.noise
+        step = now.step(precision, pull, _bounds_of_step(predictor, p, held=held))
         steady = np.abs(np.log(noise.sigma / predictor.noise.sigma)[predictor.columns]).max() < _SETTLED
-        if steady and (np.abs(step) < _CONVERGED * errors).all():
+        errors = np.sqrt(np.diag(now.robust_covariance(precision)))
+        if steady and not held and (np.abs(step) <= _CONVERGED * errors).all():
             converged = True
             break
         before = now.loss_with(noise, known)
         for _ in range(_HALVINGS):
-            then, predictor = _moved(following, p, step, held=held)
+            then, predictor = _moved(following, p, step)
             found = predictor.over_logs(then)
             if found.loss < before + 0.01 * abs(before):
                 break
             step = 0.5 * step
         p, now = then, found
     return predictor, p, now, converged
+
+
+def settled(predictor: Predictor, p: FloatArray) -> tuple[Predictor, Pass]:
+    """The predictor with the noise, and what the model lacks, of given parameters, and its pass.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    p : (n_p,) array
+    """
+    now = predictor.over_logs(p)
+    for _ in range(_SETTLING):
+        predictor = _with_scales(predictor, now, outliers=True)
+        now = predictor.over_logs(p)
+    return predictor, now
+
+
+def _with_scales(predictor: Predictor, now: Pass, *, outliers: bool) -> Predictor:
+    """The predictor with the noise, and what the model lacks, by a pass."""
+    noise = _noise_after(predictor, now, outliers=outliers)
+    factor = float(np.clip(now.surprise, 0.1, 4.0) ** (_FASTER if now.surprise < 1.0 else 0.5))
+    return replace(predictor, noise=noise, lacks=max(predictor.lacks * factor, _LEAST_LACKS))
 
 
 def _noise_after(predictor: Predictor, now: Pass, *, outliers: bool) -> Mixture:
@@ -482,13 +541,24 @@ def _noise_after(predictor: Predictor, now: Pass, *, outliers: bool) -> Mixture:
     return predictor.noise.updated(now.residuals, known, inlying, outliers=outliers)
 
 
-def _moved(predictor: Predictor, p: FloatArray, step: FloatArray, *, held: bool) -> tuple[FloatArray, Predictor]:
-    """Parameters after a step within their bounds, and the predictor with the delay after it."""
-    then = p + step[: len(p)]
+def _bounds_of_step(predictor: Predictor, p: FloatArray, *, held: bool) -> tuple[FloatArray, FloatArray]:
+    """Least and largest step: within the bounds, positive parameters at most halved or doubled, a delay by a sample."""
+    low, high = np.full(len(p), -np.inf), np.full(len(p), np.inf)
     for j, bounds in enumerate(predictor.intervals.layout.bounds):
-        then[j] = np.clip(then[j], bounds.lower, bounds.upper)
+        low[j], high[j] = bounds.lower - p[j], bounds.upper - p[j]
         if p[j] > 0.0 and (bounds.positive or bounds.lower == 0.0):
-            then[j] = np.clip(then[j], 0.5 * p[j], 2.0 * p[j])
-    if held or not predictor.free_delay:
-        return then, predictor
-    return then, replace(predictor, delay=float(np.clip(predictor.delay + np.clip(step[-1], -1.0, 1.0), -2.0, 50.0)))
+            low[j], high[j] = max(low[j], -0.5 * p[j]), min(high[j], p[j])
+        elif bounds.unit in _REACH:
+            reach = max(_REACH[bounds.unit], abs(p[j]))
+            low[j], high[j] = max(low[j], -reach), min(high[j], reach)
+    if predictor.free_delay:
+        late = 0.0 if held else 1.0
+        low, high = np.append(low, -late), np.append(high, late)
+    return low, high
+
+
+def _moved(predictor: Predictor, p: FloatArray, step: FloatArray) -> tuple[FloatArray, Predictor]:
+    """Parameters after a step, and the predictor with the delay after it."""
+    if not predictor.free_delay:
+        return p + step, predictor
+    return p + step[:-1], replace(predictor, delay=float(np.clip(predictor.delay + step[-1], -2.0, 50.0)))

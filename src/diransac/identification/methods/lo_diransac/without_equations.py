@@ -18,16 +18,16 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
-from diransac.identification.methods.lo_diransac.prediction_error import Pass, Predictor, minimised
+from diransac.identification.methods.lo_diransac.prediction_error import Pass, Predictor, minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["estimated_by_simulation"]
+__all__ = ["Followed", "estimated_by_simulation", "followed"]
 
 _SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
 """Samples of an interval; intervals of the logs at least."""
@@ -35,7 +35,7 @@ _NOTHING_KNOWN, _SMALL = 1.0, 0.01
 """Standard error of a parameter over its size from which on a log tells nothing of it; size at least."""
 _LEAST_DELAY = 0.05
 """Delay, samples, that is none."""
-_OUTLIER, _GAUSSIAN, _TINY = 0.5, 10_000, 1e-300
+_OUTLIER, _GAUSSIAN = 0.5, 10_000
 
 
 def estimated_by_simulation(
@@ -64,13 +64,7 @@ def estimated_by_simulation(
         The time limit was reached before a pass over the logs had ended.
     """
     report(callback, "following the motion", 0.0)
-    samples = [screened(settings, one, dataset.dt) for one in dataset.segments]
-    length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), _SHORTEST, _LONGEST))
-    n_rows = sum(map(len, dataset.segments))
-    if n_rows < _FEWEST_INTERVALS * length:
-        least = _FEWEST_INTERVALS * length
-        raise LogError(f"{dataset.source}: {n_rows} rows are too few; it needs at least {least}. Give a longer log")
-    intervals = replace(cut(settings, dataset, samples, length), discrepancies=False)
+    intervals, notes = _intervals(settings, dataset)
     begin = settings.start_of(dataset.layout)
     begin = np.ones(len(dataset.layout)) if begin is None else begin
     free = settings.input_delay is not False and bool(np.ptp(intervals.recorded, axis=0).any())
@@ -94,8 +88,68 @@ def estimated_by_simulation(
             f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
             "start= or --start"
         )
-    notes = tuple(dict.fromkeys(x for _, _, said in samples for x in said))
     return _Found(settings, dataset, predictor, p, now, ended, notes).estimate()
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Motion of logs as a model without equations follows it.
+
+    Parameters
+    ----------
+    signals : (N, n_signals) array
+        Over the rows of the intervals.
+    noise : (n_signals,) array
+    outliers : (N, n_signals) bool array
+    length : int
+        Rows of an interval, whose samples determine its state.
+    """
+
+    signals: FloatArray
+    noise: FloatArray
+    outliers: BoolArray
+    length: int
+
+
+def followed(
+    settings: LoDiransacSettings, dataset: Dataset, parameters: FloatArray, resolution: Resolution
+) -> Followed:
+    """Motion of logs with given parameters.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    dataset : Dataset
+    parameters : (n,) array
+    resolution : Resolution
+        With the timing of the inputs.
+
+    Raises
+    ------
+    LogError
+        The logs are too short.
+    """
+    intervals, _ = _intervals(settings, dataset)
+    delays = resolution.timing.delays
+    late = float(delays[0]) / dataset.dt if len(delays) else 0.0
+    predictor = Predictor.of(replace(intervals, hold=resolution.hold), outliers=True, free_delay=False)
+    predictor, now = settled(replace(predictor, delay=late), parameters)
+    series = predictor.trajectories(parameters, now.states)
+    known = intervals.known
+    outliers = known & (predictor.noise.inlying(now.residuals, known) < _OUTLIER)
+    return Followed(series, predictor.noise.sigma, outliers, intervals.length)
+
+
+def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, tuple[str, ...]]:
+    """Intervals of the logs, and findings of the screening.  Raises LogError: the logs are too short."""
+    samples = [screened(settings, one, dataset.dt) for one in dataset.segments]
+    length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), _SHORTEST, _LONGEST))
+    n_rows = sum(map(len, dataset.segments))
+    if n_rows < _FEWEST_INTERVALS * length:
+        least = _FEWEST_INTERVALS * length
+        raise LogError(f"{dataset.source}: {n_rows} rows are too few; it needs at least {least}. Give a longer log")
+    notes = tuple(dict.fromkeys(x for _, _, said in samples for x in said))
+    return replace(cut(settings, dataset, samples, length), discrepancies=False), notes
 
 
 @dataclass(frozen=True)
@@ -111,19 +165,12 @@ class _Found:
     notes: tuple[str, ...]
 
     def covariance(self) -> FloatArray:
-        """Covariance ``(n, n)``, the delay's last if it is estimated.
-
-        It is increased where scores of neighbouring intervals scatter more than by white noise (Huber 1967, by
-        batches), and by the step that is left.
-        """
+        """Covariance ``(n, n)``, the delay's last if it is estimated; larger by the step that is left."""
         layout, none = self.dataset.layout, np.zeros(int(self.predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
         pull = precision * np.concatenate([layout.prior_mean - self.parameters, none])
-        white = self.last.covariance(precision)
-        scatter = np.square(batch_sums(self.last.scores @ white)).sum(axis=0)
-        more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + _TINY)))
         left = self.last.step(precision, pull)
-        return np.asarray(white * np.outer(more, more) + np.diag(np.square(left)))
+        return np.asarray(self.last.robust_covariance(precision) + np.diag(np.square(left)))
 
     def estimate(self) -> Estimate:
         """The estimate."""
@@ -167,7 +214,7 @@ class _Found:
         """Findings on the fit."""
         if self.ended not in ("converged", TIME_LIMIT):
             yield Finding(
-                "care",
+                "bad",
                 "Passes over the log did not converge within their limit",
                 "begin closer, with start= or --start",
             )

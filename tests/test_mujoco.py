@@ -1,0 +1,344 @@
+"""Models of any MJCF that MuJoCo simulates: masks, rollouts, identification, files, refusals."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import diransac as dr
+from command_line import run
+from diransac.errors import DiransacError, ModelError, ResultError, SettingsError
+from diransac.model.mjcf import MujocoModel
+from diransac.simulation import Measurements, RolloutBatch, rollouts
+
+mujoco = pytest.importorskip("mujoco", reason="MODELS OF MUJOCO NOT CHECKED: mujoco is missing")
+
+# A body on a spring-loaded foot: a free base, contacts, an IMU, a payload that is nowhere measured.
+HOPPER = """<mujoco><option timestep="0.002"/><worldbody>
+  <!-- kept --><geom name="floor" type="plane" size="5 5 .1"/>
+  <body name="trunk" pos="0 0 .32"><freejoint name="base"/>
+    <inertial pos="0 0 0" mass="3" diaginertia=".03 .03 .03"/><site name="imu" pos=".02 0 0"/>
+    <body name="payload"><inertial pos="{x} 0 .02" mass="{m}" diaginertia="1e-3 1e-3 1e-3"/></body>
+    {legs}
+  </body></worldbody>
+  <actuator>{motors}</actuator>
+  <keyframe><key name="home" qpos="0 0 .32 1 0 0 0 0 0 0 0"/></keyframe>
+  <sensor><accelerometer name="acc" site="imu"/><gyro name="gyro" site="imu"/></sensor></mujoco>"""
+LEG = """<body name="leg{k}" pos="{x} {y} 0"><inertial pos="0 0 -.15" mass=".3" diaginertia="2e-3 2e-3 1e-4"/>
+      <joint name="slide{k}" type="slide" axis="0 0 1" damping="{d}" armature=".1"/>
+      <geom name="foot{k}" type="sphere" size=".02" pos="0 0 -.3" friction="{f}"/></body>"""
+CORNERS = ((0.15, 0.1), (0.15, -0.1), (-0.15, 0.1), (-0.15, -0.1))
+SERVO = '<position name="slide{k}" joint="slide{k}" kp="2000" kv="60"/>'
+
+FOUR_BAR = """<mujoco><option timestep="0.002"/><worldbody>
+  <body name="crank"><joint name="crank" axis="0 1 0" armature="{a}" damping=".02"/>
+    <inertial pos=".04 0 0" mass=".2" diaginertia="1e-4 2e-4 2e-4"/>
+    <body name="coupler" pos=".08 0 0"><joint name="coupler" axis="0 1 0" damping=".01"/>
+      <inertial pos=".1 0 0" mass="{m}" diaginertia="2e-4 1.5e-3 1.5e-3"/><site name="end" pos=".2 0 0"/></body></body>
+  <body name="rocker" pos=".2 0 0"><joint name="rocker" axis="0 1 0" damping=".01"/>
+    <inertial pos="0 0 .08" mass=".3" diaginertia="8e-4 8e-4 1e-4"/><site name="tip" pos="0 0 .16"/></body></worldbody>
+  <equality><connect site1="end" site2="tip"/></equality><actuator><motor name="drive" joint="crank"/></actuator>
+  <keyframe><key qpos="-.7853981 -.2 .6"/></keyframe></mujoco>"""
+
+
+def hopper(payload: float, x: float, friction: float, damping: float) -> str:
+    """MJCF of the hopper."""
+    legs = "".join(LEG.format(k=k, x=a, y=b, d=damping, f=friction) for k, (a, b) in enumerate(CORNERS))
+    return HOPPER.format(m=payload, x=x, legs=legs, motors="".join(SERVO.format(k=k) for k in range(4)))
+
+
+def recorded(text: str, control: Callable[[float], Any], seconds: float, names: dict[str, Any], seed: int) -> dr.Log:
+    """Log of a simulation with noise and 5 % outliers; names map columns to (function of data, noise)."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, n, rng = mujoco.MjData(model), round(seconds / 0.002), np.random.default_rng(seed)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    drives = [model.actuator(k).name for k in range(model.nu)]
+    drives = [f"{name}_ctrl" if name in names else name for name in drives]
+    rows: dict[str, list[float]] = {name: [] for name in (*names, *drives)}
+    for k in range(-200, n):
+        data.ctrl[:] = control(0.002 * k)
+        state = {name: float(of(data)) for name, (of, _) in names.items() if not name.startswith(("acc", "gyro"))}
+        inputs = dict(zip(drives, data.ctrl.tolist(), strict=True))
+        mujoco.mj_step(model, data)
+        if k >= 0:
+            state |= {name: float(of(data)) for name, (of, _) in names.items() if name not in state}
+            for name, value in (state | inputs).items():
+                rows[name].append(value)
+    columns = {name: np.array(x) for name, x in rows.items()}
+    for name, (_, noise) in names.items():
+        wrong = rng.random(n) < 0.05
+        columns[name] = columns[name] + noise * rng.standard_normal(n) + 100.0 * noise * rng.uniform(-1, 1, n) * wrong
+    return dr.Log.from_arrays(0.002 * np.arange(n), columns)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("mujoco")
+
+
+@pytest.fixture(scope="module")
+def hopper_file(folder: Path) -> Path:
+    path = folder / "hopper.xml"
+    path.write_text(hopper(0.5, 0.0, 0.8, 20.0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def four_bar(folder: Path) -> tuple[Path, dr.Log]:
+    """Nominal file of a linkage, and a log of another one."""
+    path = folder / "four-bar.xml"
+    path.write_text(FOUR_BAR.format(a=0.01, m=0.3))
+    joints = {"crank": 0, "coupler": 1, "rocker": 2}
+    names = {n: (lambda d, k=k: d.qpos[k], 5e-4) for n, k in joints.items()}
+    names |= {f"{n}_dot": (lambda d, k=k: d.qvel[k], 0.02) for n, k in joints.items()}
+    log = recorded(
+        FOUR_BAR.format(a=0.006, m=0.5), lambda t: 0.6 * np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t), 4.0, names, 1
+    )
+    return path, log
+
+
+@pytest.fixture(scope="module")
+def linkage(four_bar: tuple[Path, dr.Log]) -> tuple[MujocoModel, dr.Result]:
+    """Model of the linkage, and its identification."""
+    model = dr.models.mujoco(four_bar[0], unknown=["joint/crank.armature", "body/coupler.mass"])
+    return model, dr.identify(model, four_bar[1])
+
+
+# ---------------------------------------------------------------------- names and masks
+
+
+def test_signals_are_named_as_the_file_names_them(hopper_file: Path) -> None:
+    model = dr.models.mujoco(hopper_file, unknown=["body/payload.mass", "sensor/acc.bias"])
+    assert list(model.coordinates)[:8] == [*(f"base_{x}" for x in ("x", "y", "z", "qw", "qx", "qy", "qz")), "slide0"]
+    assert list(model.velocities)[3:7] == ["base_wx", "base_wy", "base_wz", "slide0_dot"]
+    assert list(model.sensors) == ["acc_x", "acc_y", "acc_z", "gyro_x", "gyro_y", "gyro_z"]
+    assert list(model.inputs) == [f"slide{k}_ctrl" for k in range(4)]
+    assert list(model.parameters) == ["body/payload.mass", *(f"sensor/acc.bias[{k}]" for k in range(3))]
+    assert model.parameters["body/payload.mass"].value == 0.5
+    assert (model.units["acc_x"], model.units["slide0_ddot"], model.units["base_wx_dot"]) == (
+        "m/s^2",
+        "m/s^2",
+        "rad/s^2",
+    )
+
+
+def test_a_mask_is_one_parameter_and_each_one_per_match(hopper_file: Path) -> None:
+    masks = ["geom/foot*.friction[0]", "each:joint/slide*.damping", "body/payload.ipos"]
+    model = dr.models.mujoco(hopper_file, unknown=masks)
+    damping = [f"joint/slide{k}.damping" for k in range(4)]
+    positions = [f"body/payload.ipos[{k}]" for k in range(3)]
+    assert list(model.parameters) == ["geom/foot*.friction[0]", *damping, *positions]
+    assert len(model.unknowns[0].places) == 4
+    assert model.parameters["joint/slide0.damping"].unit == "N s/m"
+
+
+@pytest.mark.parametrize(
+    ("masks", "said"),
+    [
+        (["body/tail.mass"], "matches nothing; body names are trunk, payload"),
+        (["body/trunk.weight"], "there is no body.weight; choose from mass"),
+        (["wheel/*.mass"], "choose from body, joint"),
+        (["trunk"], 'give masks such as "body/trunk.mass"'),
+        (["geom/foot0.friction[7]"], "friction has 3 entries"),
+        (["body/trunk.mass", "body/t*.mass"], "are the same; give one of them"),
+        (["joint/base.damping"], "matches nothing"),
+        ([], "nothing is unknown"),
+    ],
+)
+def test_a_mask_that_names_nothing_is_refused(hopper_file: Path, masks: list[str], said: str) -> None:
+    with pytest.raises(ModelError) as error:
+        dr.models.mujoco(hopper_file, unknown=masks)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "has no joint"),
+        ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", "cannot be compiled"),
+        (
+            '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>'
+            '<general name="slow" joint="j" dyntype="filter" dynprm="1"/></actuator></mujoco>',
+            "states besides positions and velocities (slow)",
+        ),
+    ],
+)
+def test_what_is_not_simulated_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "a.xml").write_text(text)
+    with pytest.raises(ModelError) as error:
+        dr.models.mujoco(tmp_path / "a.xml", unknown=["joint/j.damping"])
+    assert said in str(error.value)
+
+
+# ---------------------------------------------------------------------- rollouts
+
+
+def test_rollouts_are_those_of_a_recompiled_file(hopper_file: Path) -> None:
+    masks = ["body/payload.mass", "body/payload.ipos[0]", "geom/foot*.friction[0]", "joint/slide*.damping"]
+    model = dr.models.mujoco(hopper_file, unknown=masks)
+    values = (1.4, 0.05, 0.5, 33.0)
+    u = 0.02 * np.sin(0.05 * np.arange(150))[:, None] * np.ones(4)
+    batch = RolloutBatch(np.array([values]), model.home, u, 0.002)
+    simulator = rollouts(model)
+    found = simulator.trajectories(batch)[0]
+    true = mujoco.MjModel.from_xml_string(hopper(1.4, 0.05, 0.5, 33.0))
+    data = mujoco.MjData(true)
+    mujoco.mj_resetDataKeyframe(true, data, 0)
+    for k in range(len(u)):
+        np.testing.assert_allclose(found[k, :11], data.qpos, atol=2e-6)
+        data.ctrl[:] = u[k]
+        mujoco.mj_step(true, data)
+    np.testing.assert_allclose(found[-1, -6:], data.sensordata, atol=5e-3)
+
+
+def test_a_lane_depends_on_nothing_but_its_own_data(hopper_file: Path) -> None:
+    model = dr.models.mujoco(hopper_file, unknown=["body/payload.mass", "sensor/gyro.bias"])
+    rng = np.random.default_rng(0)
+    p = np.column_stack([rng.uniform(0.3, 2.0, 9), 0.01 * rng.standard_normal((9, 3))])
+    u, starts = 0.02 * rng.standard_normal((60, 4)), np.arange(9)
+    simulator = rollouts(model)
+    every = RolloutBatch(p, np.tile(model.home, (9, 1)), u, 0.002, starts, 40)
+    together = simulator.trajectories(every, threads=2)
+    for k in (0, 4, 8):
+        alone = RolloutBatch(p[k : k + 1], model.home, u, 0.002, starts[k : k + 1], 40)
+        assert np.array_equal(simulator.trajectories(alone, threads=1)[0], together[k])
+
+
+def test_slopes_are_differences_of_rollouts(four_bar: tuple[Path, dr.Log]) -> None:
+    model = dr.models.mujoco(four_bar[0], unknown=["joint/crank.armature", "body/coupler.mass", "joint/*.damping"])
+    p, n = np.array([x.value for x in model.parameters.values()]), 20
+    batch = RolloutBatch(p[None], model.home, np.full((n, 1), 0.4), 0.002)
+    nothing = Measurements(np.zeros((n, len(model.signals))), np.ones(n, bool))
+    simulator = rollouts(model)
+    found = simulator.linearized_errors(batch, nothing)
+    sums = simulator.gauss_newton(batch, nothing, np.ones(len(model.signals)))
+    J = found.jacobian.reshape(-1, len(found.unknowns))
+    np.testing.assert_allclose(sums.normal_matrix[0], J.T @ J, rtol=1e-9)
+    np.testing.assert_allclose(sums.gradient[0], J.T @ found.errors.ravel(), rtol=1e-9)
+    for j in range(len(p)):
+        step = 1e-4 * p[j] * np.eye(len(p))[j]
+        both = RolloutBatch(np.array([p + step, p - step]), model.home, batch.inputs, 0.002)
+        after, before = simulator.trajectories(both)[..., : len(model.state)]
+        slope = (after - before) / (2e-4 * p[j])
+        np.testing.assert_allclose(found.jacobian[0, :, :6, j], slope, atol=2e-3 * np.abs(slope).max())
+
+
+# ---------------------------------------------------------------------- identification
+
+
+def test_a_closed_loop_is_identified_with_outliers(linkage: tuple[MujocoModel, dr.Result]) -> None:
+    _, result = linkage
+    assert result.parameters["joint/crank.armature"] == pytest.approx(0.006, rel=0.01)
+    assert result.parameters["body/coupler.mass"] == pytest.approx(0.5, rel=0.01)
+    for name, truth in (("joint/crank.armature", 0.006), ("body/coupler.mass", 0.5)):
+        assert abs(result.parameters[name] - truth) < 4.0 * result.standard_errors[name]
+    assert result.verdict != "do not rely on this"
+    assert result.diagnosis is not None
+    assert result.diagnosis.outlier_fraction["crank"] == pytest.approx(0.05, abs=0.02)
+    assert np.isfinite(result.fit_error)
+
+
+def test_a_base_that_nothing_measures_is_followed(hopper_file: Path) -> None:
+    names: dict[str, Any] = {f"slide{k}": (lambda d, k=k: d.qpos[7 + k], 2e-4) for k in range(4)}
+    names |= {f"slide{k}_dot": (lambda d, k=k: d.qvel[6 + k], 5e-3) for k in range(4)}
+    names |= {f"acc_{x}": (lambda d, k=k: d.sensordata[k], 0.1) for k, x in enumerate("xyz")}
+    names |= {f"gyro_{x}": (lambda d, k=k: d.sensordata[3 + k], 5e-3) for k, x in enumerate("xyz")}
+    phases = np.array([0.0, 1.5, 2.5, 4.0])
+    log = recorded(hopper(1.2, 0.04, 0.8, 20.0), lambda t: 0.02 * np.sin(9.0 * t + phases), 2.0, names, 2)
+    model = dr.models.mujoco(hopper_file, unknown=["body/payload.mass", "body/payload.ipos[0]"])
+    result = dr.identify(model, log)
+    assert result.parameters["body/payload.mass"] == pytest.approx(1.2, rel=0.02)
+    assert result.parameters["body/payload.ipos[0]"] == pytest.approx(0.04, abs=0.005)
+
+
+def test_the_same_seed_gives_the_same_answer(
+    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result]
+) -> None:
+    settings = dr.Settings(threads=1)
+    again = dr.identify(linkage[0], four_bar[1], settings=settings)
+    assert again.parameters == linkage[1].parameters
+
+
+def test_what_no_contact_shows_is_named(hopper_file: Path) -> None:
+    names: dict[str, Any] = {f"slide{k}": (lambda d, k=k: d.qpos[7 + k], 2e-4) for k in range(4)}
+    log = recorded(hopper(0.5, 0.0, 0.8, 20.0), lambda t: np.full(4, 0.002 * np.sin(9.0 * t)), 1.0, names, 2)
+    model = dr.models.mujoco(hopper_file, unknown=["joint/slide*.damping", "geom/foot*.friction[1]"])
+    result = dr.identify(model, log)
+    assert "geom/foot*.friction[1]" in result.unidentifiable
+    assert "no such contact slips" in str(result)
+
+
+# ---------------------------------------------------------------------- files
+
+
+def test_results_and_descriptions_are_written_and_read(
+    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], tmp_path: Path
+) -> None:
+    path, log = four_bar
+    model, result = linkage
+    result.save(tmp_path / "a.json")
+    loaded = dr.Result.load(tmp_path / "a.json")
+    assert loaded.parameters == result.parameters
+    assert loaded.model == model
+    assert pickle.loads(pickle.dumps(model)) == model
+    assert np.array_equal(dr.simulate(loaded, log)["crank"], dr.simulate(result, log)["crank"])
+    assert dr.validate(loaded, log).rmse["crank"] > 0.0
+    assert result.export(tmp_path / "calibrated.xml", into=path) == ()
+    again = dr.models.mujoco(tmp_path / "calibrated.xml", unknown=[x.name for x in model.unknowns])
+    for name, parameter in again.parameters.items():
+        assert parameter.value == pytest.approx(result.parameters[name], rel=1e-5)
+    dr.write_report(result, log, tmp_path / "a.html")
+    assert "MuJoCo" in (tmp_path / "a.html").read_text()
+    assert set(result.sample(5)) == set(model.parameters)
+
+
+@pytest.mark.parametrize("inside", ['<asset><mesh file="/etc/passwd"/></asset>', '<include file="a.xml"/>'])
+def test_a_stored_model_that_names_files_is_refused(linkage: tuple[MujocoModel, dr.Result], inside: str) -> None:
+    from diransac.model.mjcf.model import _checksum
+
+    data = linkage[0].to_dict()
+    data["mjcf"] = data["mjcf"].replace("<worldbody>", f"{inside}<worldbody>", 1)
+    data["checksum"] = _checksum({k: x for k, x in data.items() if k != "checksum"})
+    with pytest.raises(ResultError, match="needs other files"):
+        MujocoModel.from_dict(json.loads(json.dumps(data)))
+
+
+def test_the_command_line_does_the_same(
+    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], tmp_path: Path
+) -> None:
+    path, log = four_bar
+    log.write(tmp_path / "log.csv")
+    arguments = ["--model", str(path), "--simulator", "mujoco", "--unknown", "joint/crank.armature,body/coupler.mass"]
+    done = run("identify", str(tmp_path / "log.csv"), *arguments, "-o", str(tmp_path / "a.json"), "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)["parameters"]
+    assert found["body/coupler.mass"] == pytest.approx(linkage[1].parameters["body/coupler.mass"], rel=1e-3)
+    for more, said in ((["--simulator", "gazebo"], "there is mujoco"), (["--simulator", "mujoco"], "needs --unknown")):
+        refused = run("identify", str(tmp_path / "log.csv"), "--model", str(path), *more)
+        assert refused.exit_code == 2
+        assert said in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda model, result, log: dr.identify(model, log, method="ols"),
+        lambda model, result, log: result.export("/tmp/never.c"),
+        lambda model, result, log: dr.plan(
+            result, [dict(zip(model.state, model.home, strict=True))] * 2, times=[0.0, 1.0]
+        ),
+    ],
+)
+def test_what_needs_equations_says_so(
+    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], asked: Callable[..., object]
+) -> None:
+    with pytest.raises((ModelError, SettingsError, DiransacError)) as error:
+        asked(*linkage, four_bar[1])
+    assert "equations" in str(error.value)
