@@ -12,6 +12,7 @@ as CasADi functions, which everything else takes.  Begin with `model.py`.
 | `parts.py` | independent parts of a model, such as limbs |
 | `library/` | the built-in models, a file each |
 | `robots/` | models from MJCF and URDF |
+| `mjcf/` | what MuJoCo simulates: contacts, free bases, loops |
 """
 
 from diransac.model.model import Model

@@ -10,7 +10,8 @@ the acceleration at `t_j` is the one under `u_j`.
 |---|---|
 | `batch.py` | arguments and results, and `Simulator`, the interface of a back end |
 | `integrators.py` | integration steps and their derivatives as expressions |
-| `rollouts.py` | `Rollouts`, the compiled simulator |
+| `rollouts.py` | `rollouts`, and `Rollouts`, the compiled simulator |
+| `mujoco.py` | `MujocoRollouts`, by MuJoCo |
 | `compiler/` | expression graph to machine code |
 """
 

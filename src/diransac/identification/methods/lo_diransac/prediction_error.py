@@ -51,7 +51,7 @@ _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
 _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
-_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 20, 0.5, 0.05, 3
+_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 1.0, 0.05, 3
 """Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
 are halved."""
 _SETTLING = 4
