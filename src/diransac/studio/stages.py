@@ -1,0 +1,168 @@
+"""Commands and Python lines of the stages of the page, from a `Project`; the page runs these commands and no others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from diransac.errors import SettingsError
+from diransac.studio.project import NAME, Project, quoted
+
+__all__ = ["CALLS_CODE", "RESULTS", "command", "lines"]
+
+RESULTS = "diransac-results"
+"""Folder of what the commands write, below the first folder."""
+CALLS_CODE = {"model", "map", "check", "design", "solve"}
+"""Commands that run a model's own code."""
+
+_MODEL = f"{RESULTS}/model.json"
+
+
+def command(kind: str, project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    """Words of a command after the program's name.
+
+    Parameters
+    ----------
+    kind : str
+        One of ``model``, ``map``, ``check``, ``design``, ``solve``, ``validate``, ``predict``, ``export``.
+    project : Project
+    given : mapping
+        What the page has asked for besides: ``log``, ``limits``, ``parameters``, ``horizon``, ``name``.
+    results : sequence of str
+        Files of the latest solution, one for each limb of a robot.
+
+    Raises
+    ------
+    SettingsError
+        There is no such command, or it lacks something.
+    """
+    if kind not in _COMMANDS:
+        raise SettingsError(f"there is no command {kind!r:.40}; there are {', '.join(_COMMANDS)}")
+    return _COMMANDS[kind](project, given, results)
+
+
+def _model(project: Project) -> list[str]:
+    if project.model is None:
+        raise SettingsError("there is no model yet; choose one")
+    return project.words_of_model()
+
+
+def _log(project: Project, given: Mapping[str, Any]) -> str:
+    name = given.get("log") or next(iter(project.logs), None)
+    if not isinstance(name, str):
+        raise SettingsError("there is no log yet; choose one")
+    return f"./{name}" if name.startswith("-") else name
+
+
+def _solved(results: Sequence[str]) -> list[str]:
+    if not results:
+        raise SettingsError("there is no result yet; solve first")
+    return list(results)
+
+
+def _horizon(given: Mapping[str, Any]) -> list[str]:
+    horizon = given.get("horizon")
+    return ["--horizon", f"{float(horizon):g}"] if isinstance(horizon, int | float) and horizon > 0 else []
+
+
+def _named(given: Mapping[str, Any], key: str, form: Callable[[Any], str]) -> list[str]:
+    """Numbers by name as an option's value."""
+    values = given.get(key) or {}
+    if not isinstance(values, dict) or any("," in name or "=" in name for name in values):
+        raise SettingsError(f"{key} are numbers by name, without commas")
+    return [f"{name}={form(value)}" for name, value in values.items()]
+
+
+def _design(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    # A result has the parameters with it; a model from a description has limits and nominal values.
+    source = _model(project) if project.names_robot or not results else [results[0]]
+    words = ["design", *source]
+    for text in _named(given, "limits", lambda x: f"{float(x[0]):.6g}:{float(x[1]):.6g}"):
+        words += ["--limit", text]
+    if source[0] == project.model and not project.names_robot:
+        for text in _named(given, "parameters", lambda x: f"{float(x):.6g}"):
+            words += ["--parameter", text]
+    return [*words, "--time-limit", "30", "-o", f"{RESULTS}/experiment.csv"]
+
+
+def _solve(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    if not project.logs:
+        raise SettingsError("there is no log yet; choose one")
+    _model(project)
+    return ["identify", "--config", NAME, "-o", _MODEL, "--report", f"{RESULTS}/report.html"]
+
+
+def _validate(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    if not project.held_out:
+        raise SettingsError("no log is held out; set one aside in Data")
+    held_out = [_log(project, {"log": name}) for name in project.held_out]
+    page = f"{RESULTS}/held-out.html"
+    return ["validate", _chosen(given, results), *held_out, *_horizon(given), "--report", page]
+
+
+def _predict(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    log = _log(project, given)
+    return ["predict", _chosen(given, results), log, *_horizon(given), "-o", f"{RESULTS}/predicted.csv"]
+
+
+def _chosen(given: Mapping[str, Any], results: Sequence[str]) -> str:
+    """The result of one limb; the first where none is named."""
+    found = _solved(results)
+    return str(given["result"]) if given.get("result") in found else found[0]
+
+
+def _export(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+    name, found = given.get("name"), _solved(results)
+    if not isinstance(name, str) or not re.fullmatch(r"[\w][\w .-]{0,99}", name):
+        raise SettingsError("the name of the file has letters, digits, spaces, dots and hyphens")
+    into = given.get("into")
+    if Path(name).suffix in (".xml", ".urdf") and project.names_robot:
+        return ["export", *found, "-o", f"{RESULTS}/{name}", "--into", str(project.model)]
+    if into or Path(name).suffix in (".xml", ".urdf"):
+        raise SettingsError("a description is calibrated where the model is that of a description")
+    return ["export", _chosen(given, results), "-o", f"{RESULTS}/{name}"]
+
+
+_COMMANDS: dict[str, Callable[[Project, Mapping[str, Any], Sequence[str]], list[str]]] = {
+    "model": lambda project, given, results: ["models", *_model(project)],
+    "map": lambda project, given, results: ["map", _log(project, given), "--model", *_model(project)],
+    "check": lambda project, given, results: [
+        *("inspect", _log(project, given), *project.words_of_reading(), "--model", *_model(project)),
+    ],
+    "design": _design,
+    "solve": _solve,
+    "validate": _validate,
+    "predict": _predict,
+    "export": _export,
+}
+
+
+# ---------------------------------------------------------------------- what the page shows beside a stage
+
+
+def lines(project: Project, results: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Command and Python lines by stage; a stage that lacks something has the reason in place of the command."""
+    python = project.python()
+    reading = "\n".join(line for line in python.split("\n") if not line.startswith(("model", "result", "print")))
+    model = "\n".join(line for line in python.split("\n") if line.startswith(("import", "from", "model")))
+    held_out = f"held_out = [dr.read_log(file, like=result.logs[0].preparation) for file in {project.held_out!r}]"
+    load = f"import diransac as dr\nresult = dr.Result.load({_MODEL!r})"
+    exported = f"{load}\nresult.export('dynamics.c')\ndraws = result.sample(1000)"
+    shown: dict[str, tuple[Callable[[], list[str]], str]] = {
+        "data": (lambda: ["inspect", _log(project, {}), *project.words_of_reading()], f"{reading}\nprint(dr.inspect(logs[0]))"),
+        "model": (lambda: command("model", project, {}, results), f"{model}\nprint(model)"),
+        "check": (lambda: command("check", project, {}, results), f"{python.split(chr(10) + 'result')[0]}\nprint(dr.inspect(logs[0], model))"),
+        "solve": (lambda: ["identify", *project.words()], python),
+        "results": (lambda: _validate(project, {}, results or [_MODEL]), f"{load}\n{held_out}\nprint(dr.validate(result, held_out))"),
+        "use": (lambda: ["export", *(results or [_MODEL]), "-o", "dynamics.c"], exported),
+    }  # fmt: skip
+    return {stage: {"shell": _shell(words), "python": text} for stage, (words, text) in shown.items()}
+
+
+def _shell(words: Callable[[], list[str]]) -> str:
+    try:
+        return quoted(words())
+    except SettingsError as error:
+        return f"# {error}"
