@@ -8,7 +8,7 @@ import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from starlette.applications import Starlette
@@ -25,6 +25,9 @@ from diransac.studio.project import NAME, Project
 from diransac.studio.scene import Scenes
 from diransac.studio.series import Logs, Shown
 from diransac.studio.stages import CALLS_CODE, RESULTS, command, lines
+
+if TYPE_CHECKING:
+    from diransac.identification.result import Result
 
 __all__ = ["Studio", "application"]
 
@@ -264,6 +267,7 @@ async def _job(studio: Studio, request: Request) -> Response:
 
 async def _result(studio: Studio, request: Request) -> Response:
     from diransac.identification.result import Result
+    from diransac.report.sections import interval_text
 
     name = request.query_params["name"]
     if name not in studio.results():
@@ -271,7 +275,13 @@ async def _result(studio: Studio, request: Request) -> Response:
     result = await run_in_threadpool(Result.load, studio.folders.find(name))
     rows = [] if result.competition is None else result.competition.lines()
     shown = {key: value for key, value in result.to_dict().items() if key in _OF_RESULT}
+    for key, intervals in (("intervals_text", result.intervals()), ("structural_text", _structural(result))):
+        shown[key] = {name: interval_text(*ends) for name, ends in intervals.items()}
     return _answer({**shown, "competition": {"header": rows[0], "rows": rows[1:]} if rows else None})
+
+
+def _structural(result: Result) -> Mapping[str, tuple[float, float]]:
+    return result.structural_intervals() if result.has_structure else {}
 
 
 async def _report(studio: Studio, request: Request) -> Response:

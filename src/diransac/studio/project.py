@@ -143,6 +143,10 @@ class Project(BaseModel):
         robot = self._words(_ROBOT, folder) if self.names_robot else ()
         return [*([] if self.model is None else [_placed(self.model, folder)]), *robot]
 
+    def words_of_fixing(self) -> list[str]:
+        """Options of the parameters that are known."""
+        return list(self._words(["fix"], Path()))
+
     def words(self, folder: Path = Path()) -> list[str]:
         """Arguments of ``identify``, of files beside the project."""
         model = self.words_of_model(folder)

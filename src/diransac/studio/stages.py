@@ -130,6 +130,7 @@ _COMMANDS: dict[str, Callable[[Project, Mapping[str, Any], Sequence[str]], list[
     "map": lambda project, given, results: ["map", _log(project, given), "--model", *_model(project)],
     "check": lambda project, given, results: [
         *("inspect", _log(project, given), *project.words_of_reading(), "--model", *_model(project)),
+        *project.words_of_fixing(),
     ],
     "design": _design,
     "solve": _solve,
@@ -153,12 +154,17 @@ def lines(project: Project, results: Sequence[str]) -> dict[str, dict[str, str]]
     shown: dict[str, tuple[Callable[[], list[str]], str]] = {
         "data": (lambda: ["inspect", _log(project, {}), *project.words_of_reading()], f"{reading}\nprint(dr.inspect(logs[0]))"),
         "model": (lambda: command("model", project, {}, results), f"{model}\nprint(model)"),
-        "check": (lambda: command("check", project, {}, results), f"{python.split(chr(10) + 'result')[0]}\nprint(dr.inspect(logs[0], model))"),
+        "check": (lambda: command("check", project, {}, results), f"{python.split(chr(10) + 'result')[0]}\nprint(dr.inspect(logs[0], model, fixed={_fixed(project)!r}))"),
         "solve": (lambda: ["identify", *project.words()], python),
         "results": (lambda: _validate(project, {}, results or [_MODEL]), f"{load}\n{held_out}\nprint(dr.validate(result, held_out))"),
         "use": (lambda: ["export", *(results or [_MODEL]), "-o", "dynamics.c"], exported),
     }  # fmt: skip
     return {stage: {"shell": _shell(words), "python": text} for stage, (words, text) in shown.items()}
+
+
+def _fixed(project: Project) -> dict[str, float | None]:
+    """Known parameters as Python takes them."""
+    return {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
 
 
 def _shell(words: Callable[[], list[str]]) -> str:

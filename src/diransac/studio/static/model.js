@@ -36,8 +36,8 @@ export const model = (root, now) => {
       const rest = Object.fromEntries(Object.entries(fixed).filter(([x]) => x !== name)), value = Number(text);
       if (text !== "" && !Number.isFinite(value)) say(`${text} is no number`); else change({ fix: text === "" ? rest : { ...rest, [name]: value } });
     };
-    put(equations, h("h3", {}, "Equations"), h("pre", { tabIndex: 0 }, h("code", {}, found.equations.join("\n"))),
-      h("h3", {}, "Parameters"), table_(found, fixed, fix), h("h3", {}, "Signals"),
+    put(equations, h("h3", {}, "Parameters"), table_(found, fixed, fix), h("h3", {}, "Equations"), h("pre", { tabIndex: 0 }, h("code", {}, found.equations.join("\n"))),
+      h("h3", {}, "Signals"),
       h("p", {}, Object.entries(found.signals).map(([x, unit]) => `${x} [${unit}]`).join(", ")), h("p", {}, "Inputs: ", Object.entries(found.inputs).map(([x, unit]) => `${x} [${unit}]`).join(", ")));
   };
   const table_ = (found, fixed, fix) => h(".scroll", {}, h("table", {}, h("thead", {}, h("tr", {}, ["parameter", "unit", "bounds", "nominal", "known value"].map((x) => h("th", { scope: "col" }, x)))),

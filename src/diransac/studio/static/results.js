@@ -12,8 +12,6 @@ const whisker = (value, narrow, wide) => {
   const part = (name, left, right) => { const i = h(`i.${name}`); i.style.left = at(left); if (right !== undefined) i.style.right = from(right); return i; };
   return h(".whisker", { title: "dot: estimate; line: if the model is complete; bar: if it may lack a term" }, part("wide", a, b), part("narrow", c, d), part("at", value));
 };
-const interval = (ends) => (ends && ends.every((x) => x !== null) ? `${number(ends[0])} … ${number(ends[1])}` : "unknown");
-
 // Verdict, intervals, competition, held-out prediction, and terms that the model seems to lack.
 export const results = (root, now) => {
   let chosen = "", shown = "", page = "", view = null, log = "", predicted = 0, horizon = null;
@@ -27,7 +25,7 @@ export const results = (root, now) => {
     if (key + chosen === shown) return;
     shown = key + chosen;
     const found = await get("result", { name: chosen }), { parameters, fixed, units } = found;
-    const rows = Object.keys(parameters).map((name) => [name, number(parameters[name], 5), ...(fixed.includes(name) ? ["fixed", "fixed"] : [interval(found.intervals_95[name]), found.structural_intervals_95 ? interval(found.structural_intervals_95[name]) : "not tested"]), units[name], fixed.includes(name) ? "" : whisker(parameters[name], found.intervals_95[name], found.structural_intervals_95?.[name])]);
+    const rows = Object.keys(parameters).map((name) => [name, number(parameters[name], 5), ...(fixed.includes(name) ? ["fixed", "fixed"] : [found.intervals_text[name], found.structural_text[name] || "not tested"]), units[name], fixed.includes(name) ? "" : whisker(parameters[name], found.intervals_95[name], found.structural_intervals_95?.[name])]);
     put(about, state.stale && h("p.error", {}, "The project has changed since this result was made. ", h("button", { type: "button", onclick: () => { run("solve"); location.hash = "solve"; } }, "Solve again")), verdict(found),
       table(["parameter", "estimate", "95 % interval, if the model is complete", "if it may lack a term", "unit", ""], rows),
       found.suggestions.length > 0 && h("div", {}, h("h3", {}, "Terms that the model seems to lack"), table(["term", "coefficient", "unit", "explains", "change of the model"], found.suggestions.map((x) => [x.name || x.kind, `${number(x.value)} ± ${number(x.standard_error, 2)}`, x.unit, `${Math.round(100 * x.explained)} %`, h("code", {}, x.change)])),

@@ -35,8 +35,8 @@ export const solve = (root, now) => {
     const residuals = steps.filter((x) => Object.keys(x.residuals).length).at(-1), note = steps.filter((x) => x.note).at(-1);
     const words = { running: last ? last.stage : "reading", done: "done", failed: "failed", stopped: "stopped" }[job.status];
     put(live, h("progress", { max: 1, value: job.status === "done" ? 1 : last ? last.fraction : 0, "aria-label": "progress" }), h("p", {}, h("strong", {}, words), `  ${job.status === "running" && last ? `${Math.round(100 * last.fraction)} %, ` : ""}${number(job.seconds, 3)} s`),
-      job.status === "failed" && h("p.error", {}, job.error), note && h("p", {}, note.note), h(".columns", {},
-        best && h("div", {}, h("h3", {}, "Best answer so far"), table(["parameter", "value", ""], Object.entries(best.parameters).map(([name, x]) => [name, number(x, 5), spark(answers.map((y) => y.parameters[name] ?? x))]))),
+      job.status === "failed" && h("p.error", {}, job.error, /fix/.test(job.error) && h("p", {}, h("a.button", { href: "#model" }, "Give known values in Model"))), note && h("p", {}, note.note), h(".columns", {},
+        best && h("div", {}, h("h3", {}, job.status === "running" ? "Best answer so far" : "Last answer of the search"), table(["parameter", "value", ""], Object.entries(best.parameters).map(([name, x]) => [name, number(x, 5), spark(answers.map((y) => y.parameters[name] ?? x))]))),
         residuals && h("div", {}, h("h3", {}, "Its residuals"), table(["signal", "standard deviation"], Object.entries(residuals.residuals).map(([name, x]) => [name, number(x, 3)])))),
       job.status === "done" && h("p", {}, h("a.button", { href: "#results" }, "See the results")));
   };

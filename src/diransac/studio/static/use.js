@@ -25,7 +25,7 @@ export const use = (root, now) => {
     if (!state.results.length) { drawn = ""; put(about, h(".empty", {}, "No result yet. ", h("a.button", { href: "#solve" }, "Solve"))); put(done); return; }
     const key = JSON.stringify([state.results, state.project.model]);
     if (key !== drawn) { drawn = key; drawKinds(state); }
-    const job = state.jobs.export, text = await printed(state, "export"), name = job && /diransac-results\/([^'"]+?)['"]?( --into|$)/.exec(job.command);
+    const job = state.jobs.export, text = await printed(state, "export"), name = job && /-o ['"]?diransac-results\/([^'"]+?)['"]?( --into|$)/.exec(job.command);
     put(done, outcome(job, "Writing"), text && job.status === "done" && h(".card.good", {}, text.trim().split("\n").map((x) => h("p", {}, x)), name && h("p", {}, h("a.button", { href: link("download", { name: name[1] }) }, `Download ${name[1]}`))));
   };
 };

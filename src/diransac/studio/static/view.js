@@ -49,9 +49,11 @@ export class View {
         low[j] = Math.min(low[j], x - reach); high[j] = Math.max(high[j], x + reach);
       }));
     }
-    this.center = low.map((x, j) => (x + high[j]) / 2);
-    this.size = Math.min(Math.max(...high.map((x, j) => x - low[j]), 0.1), 200);
-    this.floor = low[2];
+    const machine = this.extent(0), way = Math.max(...high.map((x, j) => x - low[j]), 0.1);
+    this.follows = way > 5 * machine.size;
+    this.size = this.follows ? 1.5 * machine.size : way;
+    this.center = this.follows ? machine.center : low.map((x, j) => (x + high[j]) / 2);
+    this.floor = this.follows ? machine.center[2] - machine.size : low[2];
     const { gl } = this, link = (...sources) => {
       const program = gl.createProgram();
       sources.forEach((source, k) => { const shader = gl.createShader(k ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER); gl.shaderSource(shader, source); gl.compileShader(shader); gl.attachShader(program, shader); });
@@ -60,8 +62,11 @@ export class View {
     };
     this.solid = link(VERTEX, FRAGMENT);
     this.thin = link(LINE, FLAT);
-    const step = 10 ** Math.floor(Math.log10(this.size)) / 2, lines = [], [cx, cy] = this.center.map((x) => Math.round(x / step) * step);
-    for (let k = -12; k <= 12; k += 1) lines.push(cx + k * step, cy - 12 * step, this.floor, cx + k * step, cy + 12 * step, this.floor, cx - 12 * step, cy + k * step, this.floor, cx + 12 * step, cy + k * step, this.floor);
+    const step = 10 ** Math.floor(Math.log10(this.size)) / 2, reach = 12 + Math.ceil(Math.min(way, 100 * step) / step), lines = [], [cx, cy] = this.center.map((x) => Math.round(x / step) * step);
+    // Short pieces, of which those behind the camera are simply not there.
+    for (let k = -reach; k <= reach; k += 1) {
+      for (let j = -reach; j < reach; j += 1) lines.push(cx + k * step, cy + j * step, this.floor, cx + k * step, cy + (j + 1) * step, this.floor, cx + j * step, cy + k * step, this.floor, cx + (j + 1) * step, cy + k * step, this.floor);
+    }
     this.grid = gl.createBuffer();
     this.lines = lines.length / 3;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.grid);
@@ -69,6 +74,13 @@ export class View {
     this.slider.max = n - 1;
     this.controls.hidden = n < 2;
     if (this.head.motions > 1) this.controls.append(h("span.key", {}, "measured"), h("span.key.second", {}, "predicted"));
+  }
+
+  extent(frame) {
+    const moving = this.shapes.map((x, k) => [x, k]).filter(([x]) => x.moves), chosen = moving.length ? moving : this.shapes.map((x, k) => [x, k]);
+    const at = (k, j) => this.places[0][(frame * this.shapes.length + k) * 12 + 9 + j];
+    const center = [0, 1, 2].map((j) => chosen.reduce((sum, [, k]) => sum + at(k, j) / chosen.length, 0));
+    return { center, size: 2 * Math.max(0.05, ...chosen.map(([x, k]) => x.reach + Math.hypot(...center.map((c, j) => at(k, j) - c)))) };
   }
 
   start() {
@@ -124,6 +136,7 @@ export class View {
   draw() {
     const { gl, canvas } = this, scale = devicePixelRatio || 1;
     if (!canvas.clientWidth) return;
+    if (this.follows) this.center = this.extent(this.frame).center;
     canvas.width = canvas.clientWidth * scale;
     canvas.height = canvas.clientHeight * scale;
     gl.viewport(0, 0, canvas.width, canvas.height);

@@ -220,13 +220,14 @@ class LocalSearch:
     def _shown(self, found: Explanation, fraction: float) -> Explanation:
         """The explanation itself, which is reported as the best so far."""
         intervals, fit = found.intervals, found.refinement.fit
-        names, signals = intervals.layout.names, intervals.model.signals
+        names, known = intervals.layout.names, intervals.known.any(axis=0)
+        measured = zip(intervals.model.signals, fit.noise.sigma.tolist(), known, strict=True)
         report(
             self.callback,
             "local optimisation",
             fraction,
             parameters=dict(zip(names, fit.shared[: len(names)].tolist(), strict=True)),
-            residuals={n: x for n, x in zip(signals, fit.noise.sigma.tolist(), strict=True) if x > 0.0},
+            residuals={n: x for n, x, known in measured if known},
         )
         return found
 
