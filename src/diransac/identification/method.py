@@ -186,7 +186,9 @@ def extremes(logs: Sequence[Log]) -> str:
     return f'"{name}" is {usual:.3g} in the median and {largest:.3g} at most; check its unit, and remove such outliers'
 
 
-def report(callback: Callback | None, stage: str, fraction: float, note: str = "", **found: Mapping[str, float]) -> None:
+def report(
+    callback: Callback | None, stage: str, fraction: float, note: str = "", **found: Mapping[str, float]
+) -> None:
     """Call the callback, if there is one, with a `Progress`.
 
     Parameters

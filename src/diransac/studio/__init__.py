@@ -48,7 +48,7 @@ def serve(given: Sequence[Path], port: int, tell: Callable[[str], None]) -> None
     studio = Studio(Folders(given))
     app = Guard(application(studio), token, [f"{name}:{port}" for name in (_LOOPBACK, "localhost")])
     config = uvicorn.Config(
-        app, log_level="error", access_log=False, ws="none", server_header=False, timeout_graceful_shutdown=1
+        app, log_level="critical", access_log=False, ws="none", server_header=False, timeout_graceful_shutdown=1
     )
 
     class Server(uvicorn.Server):

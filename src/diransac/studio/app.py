@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from diransac.errors import DiransacError, LogError, SettingsError
@@ -86,7 +86,9 @@ class Studio:
             "file": NAME,
             "project": self.project.options,
             "robot": self.project.names_robot,
-            "code": None if code is None else {"name": code[0], "sha256": code[1], "confirmed": code in self._confirmed},
+            "code": None
+            if code is None
+            else {"name": code[0], "sha256": code[1], "confirmed": code in self._confirmed},
             "results": self.results(),
             "stale": self._solved is not None and self._solved != self._solvable(),
             "commands": lines(self.project, self.results()),
@@ -128,6 +130,16 @@ class Studio:
         project.save(self.file)
         self.project = project
         self.changed()
+
+    def read_first(self) -> None:
+        """Read what a page will show first, while a browser starts; errors are told to those who ask for it."""
+        import polars  # noqa: F401  # which reads logs
+
+        from diransac.model import library  # noqa: F401  # which the list of models takes
+
+        with suppress(DiransacError, OSError):
+            for name in self.project.logs[:1]:
+                self.shown(name)
 
     def check_files(self, project: Project) -> None:
         """Raise LogError: a file of a project is not below the folders that were given."""
@@ -174,17 +186,17 @@ def _first_project(named: list[str]) -> Project:
 Endpoint = Callable[[Studio, Request], Awaitable[Response]]
 
 
-async def _page(studio: Studio, request: Request) -> Response:
+async def _page(_studio: Studio, _request: Request) -> Response:
     return FileResponse(_STATIC / "index.html")
 
 
-async def _static(studio: Studio, request: Request) -> Response:
+async def _static(_studio: Studio, request: Request) -> Response:
     name = request.path_params["name"]
     known = {path.name: path for path in _STATIC.iterdir() if path.is_file()}
     return FileResponse(known[name]) if name in known else Response(status_code=404)
 
 
-async def _events(studio: Studio, request: Request) -> Response:
+async def _events(studio: Studio, _request: Request) -> Response:
     async def told() -> AsyncIterator[str]:
         known = -1
         while not studio.ended:
@@ -198,11 +210,12 @@ async def _events(studio: Studio, request: Request) -> Response:
     return StreamingResponse(told(), media_type="text/event-stream")
 
 
-async def _files(studio: Studio, request: Request) -> Response:
+async def _files(studio: Studio, _request: Request) -> Response:
     from diransac.model.library import BUILTIN
 
     found = await run_in_threadpool(studio.folders.listed)
-    found["models"] = [x for x in found["models"] if not x["name"].startswith(RESULTS)]
+    for kind in ("logs", "models"):
+        found[kind] = [x for x in found[kind] if not x["name"].startswith(RESULTS)]
     return _answer({**found, "builtin": list(BUILTIN)})
 
 
@@ -229,7 +242,7 @@ async def _confirm(studio: Studio, request: Request) -> Response:
     return _answer({})
 
 
-async def _code(studio: Studio, request: Request) -> Response:
+async def _code(studio: Studio, _request: Request) -> Response:
     code = studio.code()
     if code is None:
         return Response(status_code=404)
@@ -252,9 +265,12 @@ async def _series(studio: Studio, request: Request) -> Response:
         for name in query.getlist("signal"):
             if name not in shown.log:
                 raise LogError(f"{shown.log.source}: it has no signal {name!r:.200}")
-            start, step, low, high = shown.window(name, begin, end, width)
-            times, values, total = shown.outliers(name, begin, end) if "outliers" in query else ([], [], 0)
-            parts += [np.array([start, step, len(low), len(times), total]), low, high, times, values]
+            if "outliers" in query:
+                times, values, total = shown.outliers(name, begin, end)
+                parts += [np.array([len(times), total]), times, values]
+            else:
+                start, step, low, high = shown.window(name, begin, end, width)
+                parts += [np.array([start, step, len(low)]), low, high]
         return np.concatenate([np.asarray(x, np.float64) for x in parts]).tobytes() if parts else b""
 
     return Response(await run_in_threadpool(content), media_type="application/octet-stream")
@@ -346,7 +362,9 @@ def application(studio: Studio) -> Starlette:
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        warming = asyncio.create_task(run_in_threadpool(studio.read_first))
         yield
+        warming.cancel()
         studio.ended = True
         studio.changed()
         await studio.jobs.end()

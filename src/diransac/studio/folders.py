@@ -11,7 +11,21 @@ from diransac.errors import LogError
 
 __all__ = ["Folders"]
 
-_LOGS = (".csv", ".csv.gz", ".tsv", ".txt", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".ulg", ".ulog", ".mcap", ".bag")
+_LOGS = (
+    ".csv",
+    ".csv.gz",
+    ".tsv",
+    ".txt",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".ulg",
+    ".ulog",
+    ".mcap",
+    ".bag",
+)
 _MODELS = (".urdf", ".mjcf", ".xml", ".py", ".json")
 _MOST, _DEEPEST = 2000, 5
 

@@ -25,13 +25,13 @@ NAME = "project.diransac.toml"
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Text = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00\n\r]*$")]
 _Stretch = Annotated[list[_Number], Field(min_length=2, max_length=2)]
-_READING = "mapping columns rate repair map scale resample unmeasured episodes".split()
-_STEPS = "from until while leave-out despike shift".split()
-_ROBOT = "unknown control motor bodies joints base".split()
-_SEARCH = (
-    "method estimator seed input-hold fix prior start horizon settings with-suggestions time-limit "
-    "differentiate bandwidth"
-).split()
+_READING = ["mapping", "columns", "rate", "repair", "map", "scale", "resample", "unmeasured", "episodes"]
+_STEPS = ["from", "until", "while", "leave-out", "despike", "shift"]
+_ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base"]
+_SEARCH = [
+    *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
+    *("with-suggestions", "time-limit", "differentiate", "bandwidth"),
+]
 _LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies"}
 """Options whose value is one text with commas."""
 _FILES = ("mapping",)
@@ -161,7 +161,9 @@ class Project(BaseModel):
                 named = f"--{'set' if key == 'settings' else key}"
                 for text in _texts(key, options[key]):
                     placed = _placed(text, folder) if key in _FILES and text.endswith(".toml") else text
-                    yield from [named] if text is _FLAG else [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
+                    yield from (
+                        [named] if text is _FLAG else [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
+                    )
 
     # ------------------------------------------------------------------ Python
 
@@ -185,7 +187,7 @@ class Project(BaseModel):
             return []
         options = self.options
         if self.names_robot:
-            given = {key: options[key] for key in ("unknown", "bodies", "joints", "base") if key in options}
+            given: dict[str, Any] = {k: options[k] for k in ("unknown", "bodies", "joints", "base") if k in options}
             given |= {"bodies": "all"} if given.get("bodies") == ["all"] else {}
             kinds = (("control", "PositionControl"), ("motor", "MotorCurrents"))
             drive = "".join(f", actuation=dr.{kind}({_given(options[k])[2:]})" for k, kind in kinds if k in options)

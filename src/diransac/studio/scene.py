@@ -141,6 +141,14 @@ def _compiled(model: str, path: str | None, roots: list[str]) -> Any:
             spec.delete(element)
     for shape in spec.geoms:
         shape.material = ""
+    _find_meshes(spec, path, roots)
+    if not [x for x in spec.geoms if x.type != mujoco.mjtGeom.mjGEOM_PLANE]:
+        _draw_links(mujoco, spec)
+    return spec.compile()
+
+
+def _find_meshes(spec: Any, path: str, roots: list[str]) -> None:
+    """Take meshes from below the folders alone; shapes of others are left out."""
     spec.strippath = False
     strange = set()
     for mesh in list(spec.meshes):
@@ -152,13 +160,15 @@ def _compiled(model: str, path: str | None, roots: list[str]) -> Any:
             mesh.file = file
     for shape in [shape for shape in spec.geoms if shape.meshname in strange]:
         spec.delete(shape)
-    if not [x for x in spec.geoms if x.type != mujoco.mjtGeom.mjGEOM_PLANE]:
-        for body in [body for body in spec.bodies if body.name != "world"]:
-            ends = [0.0, 0.0, 0.0, *body.pos]
-            if np.linalg.norm(body.pos) > 1e-3:
-                body.parent.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[0.02, 0, 0], mass=0)
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.035, 0, 0], mass=0)
-    return spec.compile()
+
+
+def _draw_links(mujoco: Any, spec: Any) -> None:
+    """Add a ball for each body, and a line from the one that bears it."""
+    for body in [body for body in spec.bodies if body.name != "world"]:
+        ends = [0.0, 0.0, 0.0, *body.pos]
+        if np.linalg.norm(body.pos) > 1e-3:
+            body.parent.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[0.02, 0, 0], mass=0)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.035, 0, 0], mass=0)
 
 
 def _with_visuals(mujoco: Any, path: str, spec: Any) -> Any:
@@ -220,7 +230,9 @@ def _columns(compiled: Any, values: Mapping[str, FloatArray]) -> Any:
 
     for k in range(compiled.njnt):
         name, place = compiled.joint(k).name or f"joint{k}", int(compiled.jnt_qposadr[k])
-        short = next((x for x in (name, identifier(name), identifier(name.removesuffix("_joint"))) if x in values), None)
+        short = next(
+            (x for x in (name, identifier(name), identifier(name.removesuffix("_joint"))) if x in values), None
+        )
         if compiled.jnt_type[k] >= 2 and short is not None:
             yield place, values[short]
         elif compiled.jnt_type[k] == 1:

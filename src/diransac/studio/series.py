@@ -15,7 +15,7 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.readers import read_fields, read_log
+from diransac.data.readers import read_log, read_topics
 from diransac.errors import LogError
 
 __all__ = ["Logs", "Shown"]
@@ -44,6 +44,7 @@ class Shown:
     fields: tuple[str, ...] = ()
     _blocks: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     _outliers: dict[str, IntArray] = field(default_factory=dict)
+    _continuous: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def facts(self) -> dict[str, Any]:
         """Names, units, rows, clock, and findings of the reader."""
@@ -96,13 +97,18 @@ class Shown:
         return float(log.time[first] + 0.5 * (size - 1) * log.dt), size * log.dt, low, high
 
     def outliers(self, name: str, begin: float, end: float) -> tuple[FloatArray, FloatArray, int]:
-        """Times and values of samples that a Hampel filter would replace, thinned out, and their number in the log."""
+        """Times and values of samples that a Hampel filter would replace, thinned out, and their number in the log.
+
+        The number is -1 for a log of too many rows to be searched.
+        """
         log = self.log
+        if len(log) > _MOST_SCANNED:
+            return np.zeros(0), np.zeros(0), -1
         if name not in self._outliers:
-            continuous = preprocessing.unwrap(log)[name] if len(log) <= _MOST_SCANNED else np.full(1, np.nan)
-            known = np.flatnonzero(np.isfinite(continuous))
+            self._continuous = self._continuous or preprocessing.unwrap(log).signals
+            known = np.flatnonzero(np.isfinite(self._continuous[name]))
             with np.errstate(over="ignore", invalid="ignore"):
-                marked = preprocessing.hampel(continuous[known])[0] if len(known) > 3 else np.zeros(len(known), bool)
+                marked = preprocessing.hampel(self._continuous[name][known])[0] if len(known) > 3 else known < 0
             self._outliers[name] = known[marked]
         rows = self._outliers[name]
         inside = rows[(log.time[rows] >= begin) & (log.time[rows] <= end)]
@@ -159,20 +165,26 @@ def _size(shown: Shown) -> int:
 
 def _shown(path: Path, reading: Mapping[str, Any]) -> Shown:
     plain = {key: reading[key] for key in ("columns", "rate", "repair") if key in reading}
-    fields, _ = read_fields(path)
-    is_table = set(fields) == {""}
-    labels = tuple(one if is_table else f"{topic}.{one}" for topic, names in fields.items() for one in names)
-    if is_table or reading.get("mapping") or reading.get("rename"):
+    topics = read_topics(path)
+    fields = {} if topics is None else topics.fields
+    labels = tuple(f"{topic}.{one}" for topic, names in fields.items() for one in names)
+    if topics is None or reading.get("mapping") or reading.get("rename"):
         try:
-            return Shown(_read(path, reading), "", labels)
+            log = _read(path, reading)
+            return Shown(log, "", labels or _columns(log, reading.get("rename", {})))
         except LogError as error:
             if plain == reading:
                 raise
             why = str(error)
     else:
         why = "no topic is mapped to a signal yet"
-    log = _read(path, plain) if is_table else _read_fields(path, list(labels[:_MOST_FIELDS]))
-    return Shown(log, why, labels)
+    log = _read(path, plain) if topics is None else _read_fields(path, list(labels[:_MOST_FIELDS]))
+    return Shown(log, why, labels or _columns(log, {}))
+
+
+def _columns(log: Log, renamed: Mapping[str, str]) -> tuple[str, ...]:
+    """Columns of a table, by their names in the file."""
+    return tuple(dict.fromkeys(renamed.get(name, name) for name in log.names))
 
 
 def _read_fields(path: Path, labels: list[str]) -> Log:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import SettingsError
+from diransac.plain_text import printable
 from diransac.studio.project import NAME, Project, quoted
 
 __all__ = ["CALLS_CODE", "RESULTS", "command", "lines"]
@@ -87,7 +88,7 @@ def _design(project: Project, given: Mapping[str, Any], results: Sequence[str]) 
     return [*words, "--time-limit", "30", "-o", f"{RESULTS}/experiment.csv"]
 
 
-def _solve(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
+def _solve(project: Project, _given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
     if not project.logs:
         raise SettingsError("there is no log yet; choose one")
     _model(project)
@@ -125,13 +126,23 @@ def _export(project: Project, given: Mapping[str, Any], results: Sequence[str]) 
     return ["export", _chosen(given, results), "-o", f"{RESULTS}/{name}"]
 
 
+def _show_model(project: Project, _given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
+    return ["models", *_model(project)]
+
+
+def _map(project: Project, given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
+    return ["map", _log(project, given), "--model", *_model(project)]
+
+
+def _check(project: Project, given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
+    reading, known = project.words_of_reading(), project.words_of_fixing()
+    return ["inspect", _log(project, given), *reading, "--model", *_model(project), *known]
+
+
 _COMMANDS: dict[str, Callable[[Project, Mapping[str, Any], Sequence[str]], list[str]]] = {
-    "model": lambda project, given, results: ["models", *_model(project)],
-    "map": lambda project, given, results: ["map", _log(project, given), "--model", *_model(project)],
-    "check": lambda project, given, results: [
-        *("inspect", _log(project, given), *project.words_of_reading(), "--model", *_model(project)),
-        *project.words_of_fixing(),
-    ],
+    "model": _show_model,
+    "map": _map,
+    "check": _check,
     "design": _design,
     "solve": _solve,
     "validate": _validate,
@@ -144,27 +155,45 @@ _COMMANDS: dict[str, Callable[[Project, Mapping[str, Any], Sequence[str]], list[
 
 
 def lines(project: Project, results: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Command and Python lines by stage; a stage that lacks something has the reason in place of the command."""
-    python = project.python()
-    reading = "\n".join(line for line in python.split("\n") if not line.startswith(("model", "result", "print")))
-    model = "\n".join(line for line in python.split("\n") if line.startswith(("import", "from", "model")))
+    """Command and Python lines by stage; a stage that lacks something has the reason in place of the command.
+
+    Parameters
+    ----------
+    project : Project
+    results : sequence of str
+        As for `command`.
+    """
+    found = results or [_MODEL]
+    shell: dict[str, Callable[[], list[str]]] = {
+        "data": lambda: ["inspect", _log(project, {}), *project.words_of_reading()],
+        "model": lambda: command("model", project, {}, found),
+        "check": lambda: command("check", project, {}, found),
+        "solve": lambda: ["identify", *project.words()],
+        "results": lambda: command("validate", project, {}, found),
+        "use": lambda: ["export", *found[:1], "-o", "dynamics.c"],
+    }
+    python = _python(project, found[0])
+    return {stage: {"shell": _shell(words), "python": python[stage]} for stage, words in shell.items()}
+
+
+def _python(project: Project, result: str) -> dict[str, str]:
+    """Python lines by stage."""
+    whole = project.python().split("\n")
+    first = [x for x in whole if x.startswith(("import", "from"))]
+    model, logs = ([x for x in whole if x.startswith(f"{name} =")] for name in ("model", "logs"))
+    load = ["import diransac as dr", f"result = dr.Result.load({result!r})"]
     held_out = f"held_out = [dr.read_log(file, like=result.logs[0].preparation) for file in {project.held_out!r}]"
-    load = f"import diransac as dr\nresult = dr.Result.load({_MODEL!r})"
-    exported = f"{load}\nresult.export('dynamics.c')\ndraws = result.sample(1000)"
-    shown: dict[str, tuple[Callable[[], list[str]], str]] = {
-        "data": (lambda: ["inspect", _log(project, {}), *project.words_of_reading()], f"{reading}\nprint(dr.inspect(logs[0]))"),
-        "model": (lambda: command("model", project, {}, results), f"{model}\nprint(model)"),
-        "check": (lambda: command("check", project, {}, results), f"{python.split(chr(10) + 'result')[0]}\nprint(dr.inspect(logs[0], model, fixed={_fixed(project)!r}))"),
-        "solve": (lambda: ["identify", *project.words()], python),
-        "results": (lambda: _validate(project, {}, results or [_MODEL]), f"{load}\n{held_out}\nprint(dr.validate(result, held_out))"),
-        "use": (lambda: ["export", *(results or [_MODEL]), "-o", "dynamics.c"], exported),
-    }  # fmt: skip
-    return {stage: {"shell": _shell(words), "python": text} for stage, (words, text) in shown.items()}
-
-
-def _fixed(project: Project) -> dict[str, float | None]:
-    """Known parameters as Python takes them."""
-    return {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
+    known = {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
+    fixed = f", fixed={known!r}" if known else ""
+    parts = {
+        "data": [*first, *logs, "print(dr.inspect(logs[0]))"],
+        "model": [*first, *model, "print(model)"],
+        "check": [*first, *model, *logs, f"print(dr.inspect(logs[0], model{fixed}))"],
+        "solve": whole,
+        "results": [*load, held_out, "print(dr.validate(result, held_out))"],
+        "use": [*load, "result.export('dynamics.c')", "draws = result.sample(1000)"],
+    }
+    return {stage: printable("\n".join(texts)) for stage, texts in parts.items()}
 
 
 def _shell(words: Callable[[], list[str]]) -> str:

@@ -46,7 +46,6 @@ export const check = (root, now) => {
     const wanted = state.commands.check.shell, job = state.jobs.check, ready = !wanted.startsWith("#") && (!state.code || state.code.confirmed);
     if (!ready) { put(status, h(".empty", {}, wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.")); put(about); return; }
     if (asked !== wanted && (!job || job.command !== wanted)) { asked = wanted; run("check"); }
-    if (!state.jobs.model || state.jobs.model.command !== state.commands.model.shell) { if (asked !== `model ${wanted}`) { asked = wanted; run("model"); } }
     put(status, outcome(job, "Reading the log and counting what it can tell"), h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")));
     if (job?.status === "failed") put(about);
     if (job?.status === "done" && job.command === wanted && shown !== `${job.number}`) { shown = `${job.number}`; found = await printed(state, "check"); limits = null; drawFound(); }

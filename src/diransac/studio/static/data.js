@@ -91,7 +91,7 @@ export const data = (root, now) => {
     };
     put(mapping, h("h3", {}, `Signals of ${name}`), h(".row", {}, h("button", { type: "button", onclick: () => { applied = -1; run("map", { log: file }); } }, "Suggest"),
       file_ && h("span.how", {}, `by the mapping ${file_}`), (file_ || Object.keys(map).length > 0) && h("button", { type: "button", onclick: () => change({ mapping: null, map: {} }) }, "Clear")),
-    outcome(jobs.map, "Looking for columns"), h(".scroll", {}, h("table", {}, h("tbody", {}, model.signals.map(row)))));
+    outcome(jobs.map, "Looking for columns"), h(".scroll.tall", {}, h("table", {}, h("tbody", {}, model.signals.map(row)))));
   };
   const suggested = async (state) => {
     const job = state.jobs.map;
@@ -103,8 +103,9 @@ export const data = (root, now) => {
     if (missing.length) say(`Not found: ${missing.join(", ")}. Choose their columns by hand.`);
     change(found.mapping ? { mapping: found.mapping, map: {} } : { map });
   };
-  get("files").then((found) => { listed = found; drawFiles(); const first = (project().logs || [])[0] || (found.logs[0] || {}).name; if (first && !file) open(first); }).catch((error) => say(error.message));
+  get("files").then((found) => { listed = found; drawFiles(); if (!file && found.logs.length) open(found.logs[0].name); }).catch((error) => say(error.message));
   return async (state) => {
+    if (!file && (state.project.logs || []).length) open(state.project.logs[0]);
     drawFiles();
     suggested(state);
     const equations = await printed(state, "model");

@@ -1,4 +1,4 @@
-import { clean, h, put, say } from "./page.js";
+import { clean, h, put, run, say } from "./page.js";
 import { data } from "./data.js";
 import { model } from "./model.js";
 import { check } from "./check.js";
@@ -8,7 +8,7 @@ import { use } from "./use.js";
 
 const STAGES = { data: ["Data", data], model: ["Model", model], check: ["Check", check], solve: ["Solve", solve], results: ["Results", results], use: ["Use", use] };
 const JOBS = { model: "model", check: "check", solve: "solve", results: "validate", use: "export" };
-let state = null, shown = null, update = () => {}, language = "shell";
+let state = null, shown = null, update = () => {}, language = "shell", asked = "";
 const chosen = () => (location.hash.slice(1) in STAGES ? location.hash.slice(1) : "data");
 
 const look = (key) => {
@@ -30,8 +30,15 @@ const drawCommands = () => {
   const copy = h("button", { type: "button", onclick: async () => { await navigator.clipboard.writeText(text).catch(() => say("the browser does not allow copying; select the text")); copy.textContent = "Copied"; } }, "Copy");
   put(document.getElementById("commands"), h(".row", {}, h("span", {}, "The same by hand:"), tab("shell", "Command line"), tab("python", "Python"), copy), h("pre", { tabIndex: 0 }, h("code", {}, text)));
 };
+const readModel = () => {
+  const wanted = state.commands.model.shell, job = state.jobs.model;
+  if (asked === wanted || !state.project.model || (job && job.command === wanted) || (state.code && !state.code.confirmed)) return;
+  asked = wanted;
+  run("model");
+};
 const draw = () => {
   if (!state) return;
+  readModel();
   put(document.getElementById("place"), `${state.folder} · kept in ${state.file}`);
   drawNav();
   drawCommands();

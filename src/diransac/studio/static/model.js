@@ -6,7 +6,7 @@ const bounds = (x) => [x.positive ? "0 <" : Number.isFinite(x.lower) && x.lower 
 
 // A built-in model, a description of a robot, a result, or the user's own code, which is named before it runs.
 export const model = (root, now) => {
-  let listed = { models: [], builtin: [] }, view = null, viewed = "", asked = "", read = "", source = null;
+  let listed = { models: [], builtin: [] }, view = null, viewed = "", read = "", source = null;
   const list = h("div"), about = h("div"), code = h("div"), place = h("div"), equations = h("div");
   put(root, h("h2", {}, "Model"), h("p.how", {}, "Choose the equations whose parameters are to be identified."),
     h(".columns", {}, h("div", {}, list), h("div", {}, about, code, place, equations)));
@@ -63,7 +63,6 @@ export const model = (root, now) => {
     drawCode(state);
     drawView(state);
     const wanted = state.commands.model.shell, job = state.jobs.model;
-    if (asked !== wanted && (!job || job.command !== wanted) && (!state.code || state.code.confirmed)) { asked = wanted; run("model"); }
     if (!job || job.command !== wanted || job.status !== "done") { read = ""; put(equations, job && job.command === wanted && outcome(job, "Reading the model")); return; }
     const key = JSON.stringify([job.number, state.project.fix]);
     if (key !== read) { read = key; drawEquations(await printed(state, "model"), state); }

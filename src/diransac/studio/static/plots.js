@@ -67,18 +67,14 @@ export class Plots {
     if (!this.names.length || !this.file) return;
     this.asked?.abort();
     const asked = this.asked = new AbortController(), [begin, end] = this.range;
-    const query = [["name", this.file], ["begin", begin], ["end", end], ["width", Math.min(1500, this.width)], ["outliers", 1], ...this.names.map((x) => ["signal", x])];
+    const query = [["name", this.file], ["begin", begin], ["end", end], ["width", Math.min(1500, this.width)], ...this.names.map((x) => ["signal", x])];
     this.box.classList.add("busy");
     try {
-      const found = new Float64Array(await numbers("series", query, asked.signal));
-      let at = 0;
-      for (const name of this.names) {
-        const [start, step, n, m, total] = found.subarray(at, at + 5), part = (k) => { at += k; return found.subarray(at - k, at); };
-        at += 5;
-        const low = part(n), high = part(n), times = part(m), marked = part(m), shown = this.plots.get(name);
-        if (shown) { shown.plot.setData(this.merged(start, step, low, high, times, marked)); put(shown.count, total ? `${total} outliers` : ""); }
-      }
-      this.painted = performance.now();
+      this.read_(await numbers("series", query, asked.signal), 3, ([start, step, n], part) => { const low = part(n); return { lines: this.merged(start, step, low, part(n)) }; });
+      this.root.dataset.painted = `${begin} ${end}`;
+      this.box.classList.remove("busy");
+      await new Promise((done) => { setTimeout(done, 150); }); // a search that nobody waits for while the view moves
+      this.read_(await numbers("series", [...query, ["outliers", 1]], asked.signal), 2, ([n, total], part) => { const times = part(n); return { marks: [times, part(n)], total }; });
     } catch (error) {
       if (error.name !== "AbortError") put(this.readout, error.message);
     } finally {
@@ -86,15 +82,33 @@ export class Plots {
     }
   }
 
-  merged(start, step, low, high, times, marked) {
+  // Parts of an answer, a head of some numbers for each signal and what it counts.
+  read_(content, width, made) {
+    const found = new Float64Array(content);
+    let at = 0;
+    const part = (k) => { at += k; return found.subarray(at - k, at); };
+    for (const name of this.names) {
+      const got = made(part(width), part), shown = this.plots.get(name);
+      if (!shown) continue;
+      Object.assign(shown, got.lines ? { marks: null } : {}, got);
+      if (got.total) put(shown.count, got.total > 0 ? `${got.total} outliers` : "too long to be searched for outliers");
+      shown.plot.setData(shown.marks ? this.marked(shown.lines, shown.marks) : [...shown.lines, shown.lines[0].map(() => null)]);
+    }
+  }
+
+  merged(start, step, low, high) {
     const thin = low.some((x, k) => x !== high[k] && !Number.isNaN(x)), t = [], y = [];
     for (let k = 0; k < low.length; k += 1) {
       const up = !thin || k % 2 === 0, x = start + k * step;
       t.push(x); y.push(up ? low[k] : high[k]);
       if (thin) { t.push(x); y.push(up ? high[k] : low[k]); }
     }
+    return [t, values(y)];
+  }
+
+  marked([t, y], [times, marked]) {
     const all = [...t.map((x, k) => [x, y[k], null]), ...Array.from(times, (x, k) => [x, undefined, marked[k]])].sort((a, b) => a[0] - b[0]);
-    return [all.map((x) => x[0]), all.map((x) => (x[1] === undefined ? undefined : values([x[1]])[0])), all.map((x) => x[2])];
+    return [0, 1, 2].map((k) => all.map((x) => x[k]));
   }
 
   zoom(begin, end) {

@@ -62,7 +62,7 @@ export class View {
     };
     this.solid = link(VERTEX, FRAGMENT);
     this.thin = link(LINE, FLAT);
-    const step = 10 ** Math.floor(Math.log10(this.size)) / 2, reach = 12 + Math.ceil(Math.min(way, 100 * step) / step), lines = [], [cx, cy] = this.center.map((x) => Math.round(x / step) * step);
+    const step = 10 ** Math.floor(Math.log10(3 * this.size)) / 2, reach = 12 + Math.ceil(Math.min(way, 30 * step) / step), lines = [], [cx, cy] = this.center.map((x) => Math.round(x / step) * step);
     // Short pieces, of which those behind the camera are simply not there.
     for (let k = -reach; k <= reach; k += 1) {
       for (let j = -reach; j < reach; j += 1) lines.push(cx + k * step, cy + j * step, this.floor, cx + k * step, cy + (j + 1) * step, this.floor, cx + j * step, cy + k * step, this.floor, cx + (j + 1) * step, cy + k * step, this.floor);

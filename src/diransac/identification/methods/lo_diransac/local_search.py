@@ -220,7 +220,7 @@ class LocalSearch:
     def _shown(self, found: Explanation, fraction: float) -> Explanation:
         """The explanation itself, which is reported as the best so far."""
         intervals, fit = found.intervals, found.refinement.fit
-        names, known = intervals.layout.names, intervals.known.any(axis=0)
+        names, known = intervals.layout.names, np.atleast_1d(intervals.known.any(axis=0))
         measured = zip(intervals.model.signals, fit.noise.sigma.tolist(), known, strict=True)
         report(
             self.callback,
