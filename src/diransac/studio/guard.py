@@ -6,12 +6,14 @@ import secrets
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from starlette.exceptions import HTTPException
+
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 __all__ = ["POLICY", "Guard"]
 
-_LARGEST_BODY = 1 << 20
+_LARGEST_BODY, _TOO_LARGE = 1 << 20, "the body is too large"
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
@@ -25,10 +27,6 @@ _HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-
-
-class _TooLarge(Exception):
-    """A body of more than `_LARGEST_BODY` bytes."""
 
 
 class Guard:
@@ -59,18 +57,11 @@ class Guard:
             await _refuse(scope, receive, send, *refusal)
             return
         inner = {**scope, "path": scope["path"][len(self._token) + 1 :], "raw_path": None, "root_path": ""}
-        begun = False
 
         async def answer(message: Message) -> None:
-            nonlocal begun
-            begun = True
             await send(_with_headers(message))
 
-        try:
-            await self._app(inner, _limited(receive), answer)
-        except _TooLarge:
-            if not begun:
-                await _refuse(scope, receive, send, 413, "the body is too large")
+        await self._app(inner, _limited(receive), answer)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
         """Status and reason for which a request is refused; None where it passes."""
@@ -94,7 +85,7 @@ class Guard:
             return 403, "the address lacks its token: open the one that diransac studio has printed"
         lengths = headers.get(b"content-length", [b"0"])
         if not lengths[0].isdigit() or int(lengths[0][:12]) > _LARGEST_BODY:
-            return 413, "the body is too large"
+            return 413, _TOO_LARGE
         return None
 
 
@@ -107,7 +98,7 @@ def _limited(receive: Receive) -> Receive:
         message = await receive()
         size += len(message.get("body", b""))
         if size > _LARGEST_BODY:
-            raise _TooLarge
+            raise HTTPException(413, _TOO_LARGE)
         return message
 
     return within
