@@ -24,6 +24,7 @@ class Answer(NamedTuple):
     body: bytes
 
     def json(self) -> Any:
+        """The body as JSON."""
         return json.loads(self.body)
 
 
@@ -39,6 +40,7 @@ class Client:
         return Studio(Folders(given))
 
     def close(self) -> None:
+        """End all jobs."""
         self.runner.run(self.studio.jobs.end())
         self.studio.scenes.close()
         self.runner.close()
@@ -83,9 +85,11 @@ class Client:
         return Answer(said[0]["status"], headers, b"".join(x.get("body", b"") for x in said[1:]))
 
     def get(self, path) -> Answer:
+        """A request of the page."""
         return self.ask(f"/{TOKEN}/{path}")
 
     def post(self, path, body) -> Answer:
+        """A request of the page that changes something."""
         return self.ask(f"/{TOKEN}/{path}", body)
 
     def finished(self, kind, seconds=30.0):

@@ -2,9 +2,13 @@
 
 import json
 import os
+import shlex
+import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +16,9 @@ import pytest
 
 import diransac as dr
 from command_line import run, working_folder
+from diransac import time_limit
 from diransac.data import preprocessing
+from diransac.identification.assessment.inspection import inspect
 from diransac.studio.project import Project
 
 pytest.importorskip("starlette", reason="STUDIO NOT CHECKED: pip install 'diransac[studio]'")
@@ -20,6 +26,7 @@ from diransac.studio.folders import Folders
 from diransac.studio.scene import _content
 from diransac.studio.series import Logs
 from diransac.studio.stages import lines
+from recordings import write_mcap
 from robots import urdf
 from studio_client import Client, write_swim
 
@@ -59,7 +66,13 @@ def test_a_project_file_reads_back_whatever_its_texts(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("model = 3", "model"), ("[out]\nx = 1", "out"), ("seed = 0.5", "seed"), ("fix = {a = 'b'}", "fix"), ("=", "TOML")],
+    [
+        ("model = 3", "model"),
+        ("[out]\nx = 1", "out"),
+        ("seed = 0.5", "seed"),
+        ("fix = {a = 'b'}", "fix"),
+        ("=", "TOML"),
+    ],
 )
 def test_a_project_file_with_something_else_is_refused(folder, text, said):
     Path("p.toml").write_text(text)
@@ -72,13 +85,24 @@ def test_words_of_a_project_are_options_of_identify():
     words = Project.of(FULL, "test").words(Path("there"))
     assert words[:4] == ["there/a.csv", "there/-b.csv", "--model", "there/arm.urdf"]
     assert Project.of(FULL, "test").words()[1] == "./-b.csv"
-    for pair in (["--leave-out", "1:2.5,3:4"], ["--fix", "g"], ["--prior", "drag=1.0,0.1"], ["--set", "outliers=false"]):
+    for pair in (
+        ["--leave-out", "1:2.5,3:4"],
+        ["--fix", "g"],
+        ["--prior", "drag=1.0,0.1"],
+        ["--set", "outliers=false"],
+    ):
         assert any(words[k : k + 2] == pair for k in range(len(words))), pair
     assert words.count("--with-suggestions") == 1
 
 
 def test_identify_takes_a_project_and_options_besides_win(folder):
-    options = {"model": "underwater-vehicle", "logs": ["swim.csv"], "method": "ols", "leave-out": [[1.0, 2.0]], "seed": 3}
+    options = {
+        "model": "underwater-vehicle",
+        "logs": ["swim.csv"],
+        "method": "ols",
+        "leave-out": [[1.0, 2.0]],
+        "seed": 3,
+    }
     Project.of(options, "test").save(folder / "sub.toml")
     os.chdir("/")
     found = json.loads(run("identify", "--config", folder / "sub.toml", "--json").stdout)
@@ -109,15 +133,14 @@ def test_every_stage_shows_a_command_that_the_command_line_takes(folder):
     write_swim(folder / "other.csv", 300, 5.0)
     run("identify", "swim.csv", "--model", "underwater-vehicle", "--method", "ols", "-o", "model.json")
     project = Project(model="underwater-vehicle", logs=["swim.csv"], held_out=["other.csv"], method="ols")
-    import shlex
-
     for stage, shown in lines(project, ["model.json"]).items():
         words = shlex.split(shown["shell"])
         (folder / "diransac-results").mkdir(exist_ok=True)
         assert words[0] == "diransac"
         done = run(*words[1:])
         assert done.exit_code == 0, (stage, done.stderr)
-        compile(shown["python"], stage, "exec")
+        if stage != "solve":  # which has a test of its own
+            exec(shown["python"], {})
     assert lines(Project(), [])["solve"]["shell"] == "diransac identify"
     assert lines(Project(), [])["check"]["shell"].startswith("# there is no log yet")
 
@@ -170,8 +193,6 @@ def test_a_mapping_that_does_not_fit_shows_the_file_s_own_columns(tmp_path):
 
 
 def test_a_recording_shows_its_fields_before_anything_is_mapped(tmp_path):
-    from recordings import write_mcap
-
     write_mcap(tmp_path / "run.mcap")
     facts = Logs().read(tmp_path / "run.mcap", {}).facts()
     assert "no topic is mapped" in facts["raw"]
@@ -297,8 +318,6 @@ def test_progress_for_programs_is_json_and_a_search_can_be_ended(folder):
 
 
 def test_a_search_that_is_ended_has_the_best_answer_so_far(folder, monkeypatch):
-    from diransac import time_limit
-
     monkeypatch.setattr(time_limit, "_ENDED", type(time_limit._ENDED)())
     seen = []
 
@@ -322,17 +341,14 @@ def test_a_search_that_is_ended_has_the_best_answer_so_far(folder, monkeypatch):
 
 def test_inspect_takes_known_parameters(folder):
     log, model = dr.read_log("swim.csv"), dr.models.underwater_vehicle()
-    assert set(dr.inspect(log, model, fixed={"mass": 50.0}).fitness.excitation) == set(model.parameters) - {"mass"}
+    assert set(inspect(log, model, fixed={"mass": 50.0}).fitness.excitation) == set(model.parameters) - {"mass"}
     found = json.loads(run("inspect", "swim.csv", "--model", "underwater-vehicle", "--fix", "mass=50", "--json").stdout)
     assert "mass" not in found["fitness"]["excitation"]
     with pytest.raises(dr.SettingsError, match="without a model"):
-        dr.inspect(log, fixed={"mass": 50.0})
+        inspect(log, fixed={"mass": 50.0})
 
 
 def test_the_server_starts_tells_its_address_and_ends_with_its_jobs_by_ctrl_c(folder):
-    import signal
-    import urllib.request
-
     words = [sys.executable, "-m", "diransac", "studio", "swim.csv", "--port", "0", "--no-browser"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as server:
         address = server.stderr.readline().split()[0]
@@ -350,13 +366,9 @@ def test_the_server_starts_tells_its_address_and_ends_with_its_jobs_by_ctrl_c(fo
 
 
 def test_a_taken_port_is_said(folder):
-    import socket
-
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         done = run("studio", "--port", other.getsockname()[1], "--no-browser")
     assert done.exit_code == 1
     assert "is not free" in done.stderr
-
-

@@ -131,14 +131,21 @@ def test_a_large_body_is_refused(client, chunks, honest):
 
 @pytest.mark.parametrize(
     ("body", "kind"),
-    [(b"{", "application/json"), (b"[]", "application/json"), (b'{"model": "x"}', "text/plain"), (b"[" * 10_000, "application/json")],
-)  # fmt: skip
+    [
+        (b"{", "application/json"),
+        (b"[]", "application/json"),
+        (b'{"model": "x"}', "text/plain"),
+        (b"[" * 10_000, "application/json"),
+    ],
+)
 def test_a_body_that_is_no_json_object_is_refused(client, body, kind):
     answer = client.ask(f"/{TOKEN}/api/project", method="POST", chunks=[body], headers={"content-type": kind})
     assert answer.status == 400
 
 
-@pytest.mark.parametrize("change", [{"output": "x"}, {"logs": "swim.csv"}, {"leave-out": [[0]]}, {"settings": {"a": []}}])
+@pytest.mark.parametrize(
+    "change", [{"output": "x"}, {"logs": "swim.csv"}, {"leave-out": [[0]]}, {"settings": {"a": []}}]
+)
 def test_a_project_takes_options_of_identify_alone(client, change):
     assert client.post("api/project", change).status == 400
 

@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import re
+import threading
 import tomllib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -60,7 +61,7 @@ class Scenes:
         """
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(1, mp_context=context)
+            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_parent)
         time = _moments(measured)
         columns = [_at(log, time) for log in (measured, predicted)]
         try:
@@ -97,6 +98,18 @@ def _at(log: Log | None, time: FloatArray) -> dict[str, FloatArray]:
 
 
 # ---------------------------------------------------------------------- in the other process
+
+
+def _end_with_parent() -> None:
+    """End this process with the page's, however that ends."""
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(0)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _content(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from diransac.data import preprocessing
 from diransac.data.log import Log
 from diransac.data.readers import read_log, read_topics
 from diransac.errors import LogError
+
+if TYPE_CHECKING:
+    from diransac.data.readers.topics import TopicTable
 
 __all__ = ["Logs", "Shown"]
 
@@ -166,8 +169,7 @@ def _size(shown: Shown) -> int:
 def _shown(path: Path, reading: Mapping[str, Any]) -> Shown:
     plain = {key: reading[key] for key in ("columns", "rate", "repair") if key in reading}
     topics = read_topics(path)
-    fields = {} if topics is None else topics.fields
-    labels = tuple(f"{topic}.{one}" for topic, names in fields.items() for one in names)
+    labels = () if topics is None else tuple(_labels(topics))
     if topics is None or reading.get("mapping") or reading.get("rename"):
         try:
             log = _read(path, reading)
@@ -180,6 +182,15 @@ def _shown(path: Path, reading: Mapping[str, Any]) -> Shown:
         why = "no topic is mapped to a signal yet"
     log = _read(path, plain) if topics is None else _read_fields(path, list(labels[:_MOST_FIELDS]))
     return Shown(log, why, labels or _columns(log, {}))
+
+
+def _labels(topics: TopicTable) -> Iterator[str]:
+    """Fields of the topics as ``--map`` takes them, elements of arrays by their names where they have some."""
+    for topic, fields in topics.fields.items():
+        named = {f"[{k}]": f"[{name}]" for k, name in enumerate(topics.elements.get(topic, ()))}
+        for one in fields:
+            start = one.find("[")
+            yield f"{topic}.{one if start < 0 else one[:start] + named.get(one[start:], one[start:])}"
 
 
 def _columns(log: Log, renamed: Mapping[str, str]) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ CALLS_CODE = {"model", "map", "check", "design", "solve"}
 """Commands that run a model's own code."""
 
 _MODEL = f"{RESULTS}/model.json"
+_INSPECT = "from diransac.identification.assessment.inspection import inspect"
 
 
 def command(kind: str, project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
@@ -186,9 +187,9 @@ def _python(project: Project, result: str) -> dict[str, str]:
     known = {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
     fixed = f", fixed={known!r}" if known else ""
     parts = {
-        "data": [*first, *logs, "print(dr.inspect(logs[0]))"],
+        "data": [*first, _INSPECT, *logs, "print(inspect(logs[0]))"],
         "model": [*first, *model, "print(model)"],
-        "check": [*first, *model, *logs, f"print(dr.inspect(logs[0], model{fixed}))"],
+        "check": [*first, _INSPECT, *model, *logs, f"print(inspect(logs[0], model{fixed}))"],
         "solve": whole,
         "results": [*load, held_out, "print(dr.validate(result, held_out))"],
         "use": [*load, "result.export('dynamics.c')", "draws = result.sample(1000)"],

@@ -43,12 +43,13 @@ const draw = () => {
   drawNav();
   drawCommands();
   if (shown !== chosen()) {
+    const first = shown === null;
     shown = chosen();
     const root = document.getElementById("stage");
     put(root);
     document.title = `${STAGES[shown][0]} · diransac studio`;
     update = STAGES[shown][1](root, () => state);
-    root.focus({ preventScroll: true });
+    if (!first) root.focus({ preventScroll: true });
     scrollTo(0, 0);
   }
   update(state);
