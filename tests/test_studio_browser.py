@@ -170,7 +170,6 @@ def test_every_stage_fits_its_window_light_and_dark(page, server, width, dark):
 def test_plots_zoom_by_keyboard_and_a_drag_leaves_a_stretch_out(page, server):
     page.open(server.address)
     page.click(".list button", "swim.csv")
-    plot = page.wait(".plot canvas")
     painted = "return document.querySelector('[data-painted]').dataset.painted.split(' ').map(Number)"
     page.wait("[data-painted]")
     before = page.driver.execute_script(painted)
@@ -182,6 +181,7 @@ def test_plots_zoom_by_keyboard_and_a_drag_leaves_a_stretch_out(page, server):
     assert np.ptp(after) == pytest.approx(np.ptp(before) / 2, rel=1e-6)
     frame.send_keys("0")
     page.click("main button", "Drag to leave out")
+    plot = page.wait(".plot .u-over")
     moves = webdriver.ActionChains(page.driver).move_to_element(plot).click_and_hold()
     moves.move_by_offset(80, 0).release().perform()
     page.wait(".chip", "✕")

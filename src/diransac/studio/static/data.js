@@ -18,8 +18,11 @@ export const data = (root, now) => {
   });
   const role = (name) => ROLES.map(([key]) => key).find((key) => key && (project()[key] || []).includes(name)) || "";
   const setRole = (name, key) => {
-    const lists = Object.fromEntries(["logs", "held-out"].map((x) => [x, (project()[x] || []).filter((y) => y !== name)]));
-    if (key) lists[key].push(name);
+    const lists = {};
+    for (const x of ["logs", "held-out"]) {
+      const rest = (project()[x] || []).filter((y) => y !== name);
+      if (key === x) lists[x] = [...rest, name]; else if (rest.length < (project()[x] || []).length) lists[x] = rest;
+    }
     change(lists);
     if (key) open(name);
   };
