@@ -134,8 +134,6 @@ def test_a_new_user_comes_from_a_log_to_an_exported_model_without_the_keyboard(p
     page.wait(".card h3", "usable")
     page.click("main button", "Predict other.csv")
     page.wait(".card h3", "Held out")
-    page.click("main button", "Show the motion")
-    page.wait(".place canvas")
     frame = page.wait("iframe")
     page.driver.switch_to.frame(frame)
     page.wait("h2", "Parameters")
@@ -150,8 +148,7 @@ def test_a_new_user_comes_from_a_log_to_an_exported_model_without_the_keyboard(p
     assert not page.complaints()
 
 
-@pytest.mark.parametrize("width", [1400, 800])
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(("width", "dark"), [(1400, False), (800, True)])
 def test_every_stage_fits_its_window_light_and_dark(page, server, width, dark):
     page.open(server.address, "data", width, dark)
     for stage in STAGES:
