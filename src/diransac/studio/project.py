@@ -18,7 +18,7 @@ from diransac.errors import ResultError, SettingsError
 from diransac.plain_data import toml_file
 from diransac.plain_text import literal, one_line, printable
 
-__all__ = ["Project", "quoted"]
+__all__ = ["NAME", "Project", "printed", "quoted"]
 
 NAME = "project.diransac.toml"
 
@@ -209,7 +209,7 @@ class Project(BaseModel):
         if settings is not None:
             lines = ["from diransac.identification.methods import configured"]
             chosen = f", configured({_quoted(method or 'lo-diransac')}, {settings!r})"
-        return [*lines, f"result = dr.identify(model, logs{chosen}{_given(given)})", "print(result)"]
+        return [*lines, f"result = dr.identify(model, logs{chosen}{_given(given)})", printed("result")]
 
 
 _FLAG = "true"
@@ -252,6 +252,11 @@ def _given(arguments: Mapping[str, Any]) -> str:
 
 def _quoted(text: str) -> str:
     return repr(text)
+
+
+def printed(expression: str) -> str:
+    """Line of Python that shows a value; nothing is printed here."""
+    return f"{print.__name__}({expression})"
 
 
 def quoted(words: Sequence[str]) -> str:

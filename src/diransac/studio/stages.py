@@ -9,7 +9,7 @@ from typing import Any
 
 from diransac.errors import SettingsError
 from diransac.plain_text import printable
-from diransac.studio.project import NAME, Project, quoted
+from diransac.studio.project import NAME, Project, printed, quoted
 
 __all__ = ["CALLS_CODE", "RESULTS", "command", "lines"]
 
@@ -187,11 +187,11 @@ def _python(project: Project, result: str) -> dict[str, str]:
     known = {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
     fixed = f", fixed={known!r}" if known else ""
     parts = {
-        "data": [*first, _INSPECT, *logs, "print(inspect(logs[0]))"],
-        "model": [*first, *model, "print(model)"],
-        "check": [*first, _INSPECT, *model, *logs, f"print(inspect(logs[0], model{fixed}))"],
+        "data": [*first, _INSPECT, *logs, printed("inspect(logs[0])")],
+        "model": [*first, *model, printed("model")],
+        "check": [*first, _INSPECT, *model, *logs, printed(f"inspect(logs[0], model{fixed})")],
         "solve": whole,
-        "results": [*load, held_out, "print(dr.validate(result, held_out))"],
+        "results": [*load, held_out, printed("dr.validate(result, held_out)")],
         "use": [*load, "result.export('dynamics.c')", "draws = result.sample(1000)"],
     }
     return {stage: printable("\n".join(texts)) for stage, texts in parts.items()}

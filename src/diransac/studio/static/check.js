@@ -39,7 +39,7 @@ export const check = (root, now) => {
   };
   const drawDesigned = async (state) => {
     const made = await printed(state, "design");
-    put(outcomeOfDesign, made && [table(["parameter", "standard error to expect", "of it with plain sines", "unit"], Object.entries(made.parameters).map(([name, x]) => [name, number(x.standard_error, 3), number(x.multisine_standard_error, 3), x.unit])),
+    put(outcomeOfDesign, made && [table(["parameter", "standard error to expect", "with plain sines", "unit"], Object.entries(made.parameters).map(([name, x]) => [name, number(x.standard_error, 3), number(x.multisine_standard_error, 3), x.unit])),
       h("p", {}, h("a.button", { href: link("download", { name: "experiment.csv" }) }, "Download experiment.csv"))]);
   };
   return async (state) => {
