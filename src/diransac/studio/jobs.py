@@ -76,7 +76,7 @@ class Jobs:
 
     def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
         self._folder, self._changed, self._count = folder, changed, 0
-        self._tasks = set[asyncio.Task[None]]()
+        self._tasks, self._one_at_a_time = set[asyncio.Task[None]](), asyncio.Lock()
         self.latest = dict[str, Job]()
 
     async def start(self, kind: str, words: Sequence[str], *, as_json: bool = True) -> Job:
@@ -90,20 +90,21 @@ class Jobs:
         as_json : bool
             Whether the command prints JSON.
         """
-        await self.stop(kind, at_once=True)
-        self._count += 1
-        job = self.latest[kind] = Job(list(words), self._count)
-        more = ["--json", "--progress-json"] if as_json else []
-        # Paths are given by the words alone: no module beside the logs is imported.
-        job.process = await asyncio.create_subprocess_exec(
-            *[sys.executable, "-P", "-m", "diransac", *words, *more],
-            cwd=self._folder,
-            env={**os.environ, "PYTHONSAFEPATH": "1"},
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            limit=_LONGEST_LINE,
-        )
+        async with self._one_at_a_time:
+            await self.stop(kind, at_once=True)
+            self._count += 1
+            job = self.latest[kind] = Job(list(words), self._count)
+            more = ["--json", "--progress-json"] if as_json else []
+            # Paths are given by the words alone: no module beside the logs is imported.
+            job.process = await asyncio.create_subprocess_exec(
+                *[sys.executable, "-P", "-m", "diransac", *words, *more],
+                cwd=self._folder,
+                env={**os.environ, "PYTHONSAFEPATH": "1"},
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                limit=_LONGEST_LINE,
+            )
         task = asyncio.create_task(self._follow(job, as_json=as_json))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -151,7 +151,7 @@ class Project(BaseModel):
         """Arguments of ``identify``, of files beside the project."""
         model = self.words_of_model(folder)
         chosen = ["--model", *model] if model else []
-        logs = [_placed(log, folder) for log in self.logs]
+        logs = [_hyphenless(str(folder / log)) for log in self.logs]
         return [*logs, *chosen, *self.words_of_reading(folder), *self._words(_SEARCH, folder)]
 
     def _words(self, keys: Sequence[str], folder: Path) -> Iterator[str]:
@@ -238,11 +238,14 @@ def _pair(key: str, name: str, value: Any) -> str:
 
 
 def _placed(text: str, folder: Path) -> str:
-    """A file beside the project as the command finds it, never a word that begins like an option."""
+    """A model or file beside the project as the command finds it, never a word that begins like an option."""
     file, py, name = text.partition(".py:")
     is_file = py or Path(text).suffix or "/" in text
-    placed = str(folder / file) + py + name if is_file else text
-    return f"./{placed}" if placed.startswith("-") else placed
+    return _hyphenless(str(folder / file) + py + name if is_file else text)
+
+
+def _hyphenless(text: str) -> str:
+    return f"./{text}" if text.startswith("-") else text
 
 
 def _given(arguments: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,7 @@ def _studio(
     def tell(address: str) -> None:
         screen.note(f"{address}  (Ctrl-C ends it)")
         if not no_browser:
-            webbrowser.open(address)
+            # A browser of the terminal would hold the server up.
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 
     serve(files or [], port, tell)
