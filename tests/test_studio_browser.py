@@ -12,6 +12,8 @@ import pytest
 import diransac as dr
 from studio_client import write_swim
 
+exceptions = pytest.importorskip("selenium.common.exceptions", reason="STUDIO NOT LOOKED AT: selenium is missing")
+StaleElementReferenceException = exceptions.StaleElementReferenceException
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DRIVER = shutil.which("chromedriver")
 pytest.importorskip("starlette", reason="STUDIO NOT LOOKED AT: pip install 'diransac[studio]'")
@@ -67,13 +69,23 @@ class Page:
 
     def click(self, selector, text=""):
         """Click on the first element with a text."""
-        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", self.wait(selector, text))
-        self.wait(selector, text).click()
+        for _ in range(20):
+            found = self.wait(selector, text)
+            try:
+                self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", found)
+                found.click()
+            except StaleElementReferenceException:  # it has just been drawn again
+                continue
+            return
 
     def choose(self, label, value):
         """Choose an entry of a menu."""
-        script = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('change', {bubbles: true}))"
-        self.driver.execute_script(script, self.wait(f"select[aria-label='{label}']"), value)
+        self.wait(f"select[aria-label='{label}']")
+        script = (
+            "const x = document.querySelector(arguments[0]);"
+            "x.value = arguments[1]; x.dispatchEvent(new Event('change'))"
+        )
+        self.driver.execute_script(script, f"select[aria-label='{label}']", value)
 
     def go(self, stage):
         """Go to a stage by its link."""

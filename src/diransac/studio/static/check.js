@@ -1,4 +1,4 @@
-import { h, link, number, outcome, printed, put, run, table } from "./page.js";
+import { h, link, number, outcome, printed, put, run, table, unchanged } from "./page.js";
 
 const WORDS = { well: ["well determined", "is-good"], weakly: ["weakly determined", "is-care"], not: ["not determined", "is-bad"] };
 
@@ -44,12 +44,12 @@ export const check = (root, now) => {
   };
   return async (state) => {
     const wanted = state.commands.check.shell, job = state.jobs.check, ready = !wanted.startsWith("#") && (!state.code || state.code.confirmed);
-    if (!ready) { put(status, h(".empty", {}, wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.")); put(about); return; }
+    if (!ready) { unchanged(status); shown = ""; put(status, h(".empty", {}, wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.")); put(about); return; }
     if (asked !== wanted && (!job || job.command !== wanted)) { asked = wanted; run("check"); }
-    put(status, outcome(job, "Reading the log and counting what it can tell"), h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")));
+    if (!unchanged(status, job?.number, job?.status)) put(status, outcome(job, "Reading the log and counting what it can tell"), h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")));
     if (job?.status === "failed") put(about);
     if (job?.status === "done" && job.command === wanted && shown !== `${job.number}`) { shown = `${job.number}`; found = await printed(state, "check"); limits = null; drawFound(); }
-    if (!document.activeElement || !design.contains(document.activeElement) || state.jobs.design?.status) await drawDesign(state);
+    if (!unchanged(design, job?.number, job?.status, state.jobs.model?.status, state.jobs.design?.number, state.jobs.design?.status, state.project.fix, Boolean(found))) await drawDesign(state);
     drawDesigned(state);
   };
 };

@@ -1,4 +1,4 @@
-import { change, choice, get, h, number, outcome, printed, put, run, say } from "./page.js";
+import { change, choice, get, h, number, outcome, printed, put, run, say, unchanged } from "./page.js";
 import { Plots } from "./plots.js";
 
 const ROLES = [["", "–"], ["logs", "use"], ["held-out", "hold out"]];
@@ -26,7 +26,7 @@ export const data = (root, now) => {
     change(lists);
     if (key) open(name);
   };
-  const drawFiles = () => put(files, listed.logs.length ? h("ul.list", {}, listed.logs.map(({ name, size: bytes }) => h(name === file ? "li.chosen" : "li", {},
+  const drawFiles = () => unchanged(files, listed, file, project().logs, project()["held-out"]) || put(files, listed.logs.length ? h("ul.list", {}, listed.logs.map(({ name, size: bytes }) => h(name === file ? "li.chosen" : "li", {},
     h("button", { type: "button", title: name, onclick: () => open(name) }, name), h("span.size", {}, size(bytes)),
     choice(role(name), ROLES, { "aria-label": `role of ${name}`, onchange: (event) => setRole(name, event.target.value) })))) : h(".empty", {}, "No logs in these folders."),
   listed.more && h("p.how", {}, "There are more files; start diransac studio with a smaller folder."));
@@ -67,6 +67,7 @@ export const data = (root, now) => {
     drawMapping();
   };
   const drawModes = () => {
+    if (unchanged(modes, plots.mode, project()["leave-out"])) return;
     const mode = (key, text) => h("button", { type: "button", "aria-pressed": String(plots.mode === key), onclick: () => { plots.mode = key; canvas.classList.toggle("leaving", key === "leave"); drawModes(); } }, text);
     put(modes, mode("zoom", "Drag to zoom"), mode("leave", "Drag to leave out"), h("button", { type: "button", onclick: () => plots.zoom(...plots.home) }, "Whole log"),
       h("span.how", {}, "Double-click or 0: all; arrows, + and −; Shift and wheel."));
@@ -78,6 +79,7 @@ export const data = (root, now) => {
   let model = null;
   const drawMapping = () => {
     const { project: { mapping: file_, map = {}, model: name }, jobs } = now();
+    if (unchanged(mapping, now().project, model, facts, jobs.map?.number, jobs.map?.status)) return;
     if (!name) { put(mapping, h("h3", {}, "Signals of the model"), h("p.how", {}, "Choose a model to see which of its signals the log has.")); return; }
     if (!model || !facts) { put(mapping, h("h3", {}, "Signals of the model"), h("p.how", {}, facts ? "Read the model in Model first." : "")); return; }
     const columns = facts.fields, has = new Set(facts.signals.map((x) => x.name));

@@ -1,4 +1,4 @@
-import { clean, h, put, run, say } from "./page.js";
+import { clean, h, put, run, say, unchanged } from "./page.js";
 import { data } from "./data.js";
 import { model } from "./model.js";
 import { check } from "./check.js";
@@ -19,13 +19,14 @@ const look = (key) => {
   if (key === "solve") return found.length ? (state.stale ? "care" : "done") : "";
   return job && job.status === "done" ? "done" : "";
 };
-const drawNav = () => put(document.getElementById("stages"), Object.entries(STAGES).map(([key, [name]]) => {
+const drawNav = () => unchanged(document.getElementById("stages"), chosen(), Object.keys(STAGES).map(look)) || put(document.getElementById("stages"), Object.entries(STAGES).map(([key, [name]]) => {
   const link = h("a", { href: `#${key}`, className: look(key) }, h("i"), name);
   if (key === chosen()) link.setAttribute("aria-current", "page");
   return link;
 }));
 const drawCommands = () => {
   const commands = state.commands[chosen()], text = clean(commands[language]);
+  if (unchanged(document.getElementById("commands"), text, language)) return;
   const tab = (key, name) => h("button", { type: "button", "aria-pressed": String(language === key), onclick: () => { language = key; drawCommands(); } }, name);
   const copy = h("button", { type: "button", onclick: async () => { await navigator.clipboard.writeText(text).catch(() => say("the browser does not allow copying; select the text")); copy.textContent = "Copied"; } }, "Copy");
   put(document.getElementById("commands"), h(".row", {}, h("span", {}, "The same by hand:"), tab("shell", "Command line"), tab("python", "Python"), copy), h("pre", { tabIndex: 0 }, h("code", {}, text)));

@@ -1,4 +1,4 @@
-import { change, choice, get, h, number, outcome, post, printed, put, run, say } from "./page.js";
+import { change, choice, get, h, number, outcome, post, printed, put, run, say, unchanged } from "./page.js";
 import { View } from "./view.js";
 
 const UNKNOWN = ["armature", "damping", "friction", "spring", "stribeck", "offset"];
@@ -13,10 +13,12 @@ export const model = (root, now) => {
   const pick = (name) => change({ model: name, fix: {}, unknown: null, bodies: null, base: null, joints: null, control: {}, motor: {} });
   const entries = (title, names) => names.length > 0 && [h("h3", {}, title), h("ul.list", {}, names.map((name) => h(name === now().project.model ? "li.chosen" : "li", {}, h("button", { type: "button", "aria-pressed": String(name === now().project.model), onclick: () => pick(name) }, name))))];
   const drawList = () => {
+    if (unchanged(list, listed, now().project.model)) return;
     const of = (...endings) => listed.models.map((x) => x.name).filter((x) => endings.some((y) => x.toLowerCase().endsWith(y)));
     put(list, entries("Built in", listed.builtin), entries("Descriptions of robots", of(".urdf", ".xml", ".mjcf")), entries("Your own code", of(".py")), entries("Results", of(".json").filter((x) => !x.endsWith("-metadata.json"))));
   };
   const drawRobot = (state) => {
+    if (unchanged(about, state.project, state.robot)) return;
     const { project } = state, chosen = project.unknown || ["armature", "damping", "friction"];
     const toggle = (x) => change({ unknown: chosen.includes(x) ? chosen.filter((y) => y !== x) : [...chosen, x] });
     put(about, h("h3", {}, project.model), state.robot && h("div", {}, h(".row", {}, "Unknown in every joint:", UNKNOWN.map((x) => h("button.chip", { type: "button", "aria-pressed": String(chosen.includes(x)), onclick: () => toggle(x) }, x))),
@@ -27,6 +29,7 @@ export const model = (root, now) => {
     if (!state.code) { put(code); source = null; return; }
     if (!source || source.sha256 !== state.code.sha256) source = await get("code").catch((error) => say(error.message));
     if (!source) return;
+    if (unchanged(code, state.code, source)) return;
     put(code, h("pre", { tabIndex: 0 }, h("code", {}, source.text)), !state.code.confirmed && h(".card.care", {}, h("h3", {}, `Run ${state.code.name}?`), h("p", {}, "It is a program and runs with your rights. It has not been run yet."),
       h("button.main", { type: "button", onclick: async () => { if (await post("confirm", { name: source.name, sha256: source.sha256 })) run("model"); } }, `Run ${state.code.name}`)));
   };
@@ -58,7 +61,7 @@ export const model = (root, now) => {
   get("files").then((found) => { listed = found; drawList(); }).catch((error) => say(error.message));
   return async (state) => {
     drawList();
-    if (!state.project.model) { put(about, h(".empty", {}, "No model yet.")); put(code); put(place); put(equations); return; }
+    if (!state.project.model) { unchanged(about); put(about, h(".empty", {}, "No model yet.")); put(code); put(place); put(equations); return; }
     drawRobot(state);
     drawCode(state);
     drawView(state);

@@ -19,6 +19,14 @@ export const put = (element, ...children) => {
   element.replaceChildren(...nodes.map((x) => (x instanceof Node ? x : document.createTextNode(clean(x)))));
 };
 
+// What is shown is drawn again only where it is another, so that no menu closes under the hand.
+const drawn = new WeakMap();
+export const unchanged = (element, ...about) => {
+  const key = JSON.stringify(about), same = drawn.get(element) === key && element.childNodes.length > 0;
+  drawn.set(element, key);
+  return same;
+};
+
 const answer = async (response) => {
   if (response.ok) return response;
   const said = await response.json().catch(() => ({}));

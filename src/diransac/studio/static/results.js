@@ -1,4 +1,4 @@
-import { change, choice, get, h, link, number, outcome, printed, put, run, say, table } from "./page.js";
+import { change, choice, get, h, link, number, outcome, printed, put, run, say, table, unchanged } from "./page.js";
 import { View } from "./view.js";
 
 const LEVELS = { usable: "good", "usable with care": "care", "do not rely on this": "bad" };
@@ -34,6 +34,7 @@ export const results = (root, now) => {
   };
   const drawHeld = async (state) => {
     const heldOut = state.project["held-out"] || [], made = await printed(state, "validate");
+    if (unchanged(held, heldOut, made, state.results, state.jobs.validate?.status, state.jobs.validate?.error, chosen)) return;
     put(held, h("h3", {}, "Prediction over held-out logs"), heldOut.length ? h(".row", {}, h("button", { type: "button", disabled: !state.results.length || state.jobs.validate?.status === "running", onclick: () => run("validate", { horizon, result: chosen }) }, `Predict ${heldOut.join(", ")}`),
       h("label", {}, "restart every", h("input", { type: "number", step: "any", min: 0, value: horizon ?? "", placeholder: "auto", onchange: (event) => { horizon = Number(event.target.value) || null; } }), "s")) : h("p.how", {}, "No log is held out. ", h("a", { href: "#data" }, "Set one aside in Data.")),
     outcome(state.jobs.validate, "Predicting"), made && verdict(made, "Held out"));
@@ -51,6 +52,7 @@ export const results = (root, now) => {
     const logs = [...(state.project["held-out"] || []), ...(state.project.logs || [])], job = state.jobs.predict;
     if (!logs.includes(log)) [log] = logs;
     if (!state.results.length || !log || state.code || state.project.model?.endsWith(".json")) { put(motion); return; }
+    if (job?.status === "done" ? unchanged(motion, logs, log, job.number, predicted !== -1) : unchanged(motion, logs, log, job?.status, job?.error)) return;
     const place = motion.querySelector(".place") || h(".place");
     put(motion, h("h3", {}, "Measured beside predicted motion"), h(".row", {}, h("label", {}, "Log", choice(log, logs.map((x) => [x, x]), { onchange: (event) => { log = event.target.value; } })), h("button", { type: "button", disabled: job?.status === "running", onclick: () => { predicted = -1; run("predict", { log, horizon: horizon || 1, result: chosen }); } }, "Show the motion")), outcome(job, "Predicting"), place);
     if (job?.status !== "done" || predicted !== -1) return;
