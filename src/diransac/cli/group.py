@@ -45,7 +45,7 @@ _MODULES = {
 }
 """Commands, in the order of ``--help``, and their modules in `diransac.cli.commands`."""
 
-_CONFIG, _WITH_PROJECT = "--config", ("identify", "compare", "cross-validate")
+_CONFIG = "--config"
 
 _VERBOSITY = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 
@@ -118,9 +118,9 @@ class Group(TyperGroup):
 
 
 def _configured(words: list[str]) -> list[str]:
-    """Words of a command with the options of its project file in place of ``--config FILE``, before those given."""
+    """Words of ``identify`` with the options of its project file in place of ``--config FILE``, before those given."""
     at = next((k for k, word in enumerate(words) if word.partition("=")[0] == _CONFIG), None)
-    if at is None or words[0] not in _WITH_PROJECT:
+    if at is None or words[0] != "identify":
         return words
     _, equals, joined = words[at].partition("=")
     rest = words[at + 1 :] if equals else words[at + 2 :]

@@ -217,10 +217,6 @@ class Search:
     ] = None
 
     time_limit: TimeLimit = None
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.toml", help="A project: logs, model and options; those given besides it win."),
-    ] = None
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `diransac.identify`, without method and time limit.
