@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from command_line import run, working_folder
+from command_line import run, swim, working_folder
 from diransac import time_limit
 from diransac.data import preprocessing
 from diransac.identification.assessment.inspection import inspect
@@ -279,6 +279,27 @@ def test_a_solve_goes_from_start_to_a_report_and_an_export(folder):
         assert not client.studio.state()["stale"]
         client.post("api/project", {"seed": 4})
         assert client.studio.state()["stale"]
+    finally:
+        client.close()
+
+
+def test_terms_that_a_model_lacks_are_shown_and_added_by_a_click(folder):
+    t = np.arange(300) * 0.01
+    columns = swim(t)
+    columns["thrust"] = columns["thrust"] + 40.0 * columns["x"]
+    noise = 0.001 * np.random.default_rng(0).standard_normal((2, 300))
+    columns |= {"x": columns["x"] + noise[0], "x_dot": columns["x_dot"] + noise[1]}
+    dr.Log.from_arrays(t, {n: columns[n] for n in ("x", "x_dot", "thrust")}).write("spring.csv")
+    client = Client(folder)
+    try:
+        client.post("api/project", {"model": "underwater-vehicle", "logs": ["spring.csv"], "fix": {"bias": 2.0}})
+        client.post("api/run", {"kind": "solve"})
+        assert client.finished("solve").status == "done", client.studio.jobs.latest["solve"].error
+        shown = client.get("api/result?name=diransac-results/model.json").json()
+        assert len(shown["changes"]) == len(shown["suggestions"]) > 0
+        assert "x" in shown["changes"][0]
+        client.post("api/project", {"with-suggestions": True})
+        assert "--with-suggestions" in client.studio.state()["commands"]["solve"]["shell"]
     finally:
         client.close()
 

@@ -293,6 +293,7 @@ async def _result(studio: Studio, request: Request) -> Response:
     shown = {key: value for key, value in result.to_dict().items() if key in _OF_RESULT}
     for key, intervals in (("intervals_text", result.intervals()), ("structural_text", _structural(result))):
         shown[key] = {name: interval_text(*ends) for name, ends in intervals.items()}
+    shown["changes"] = [x.change for x in result.suggestions]
     return _answer({**shown, "competition": {"header": rows[0], "rows": rows[1:]} if rows else None})
 
 
