@@ -27,7 +27,10 @@ TABLES = {
     "study export": ["study", "export", "a.db", "--to", "csv", "-o", "out.csv"],
     "fleet export": ["fleet", "export", "fleet.db", "-o", "out.csv"],
 }
-OTHERS = {"identify", "compare", "validate", "cross-validate", "inspect", "map", "export", "models", "cache", "view"}
+OTHERS = {
+    *("identify", "compare", "validate", "cross-validate", "inspect", "map", "export", "models", "cache", "view"),
+    "studio",
+}
 """Commands that write no CSV."""
 
 

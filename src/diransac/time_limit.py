@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from threading import Event
 from time import monotonic
 from typing import NamedTuple
 
 from diransac.errors import SettingsError, TimeLimitError
 
-__all__ = ["check_time", "time_left", "time_limited", "time_unlimited"]
+__all__ = ["check_time", "end_search", "time_left", "time_limited", "time_unlimited"]
 
 
 class _Deadline(NamedTuple):
@@ -23,6 +24,10 @@ class _Deadline(NamedTuple):
 
 _NONE = _Deadline(math.inf, math.inf)
 _NEXT = ContextVar("deadline", default=_NONE)
+_UNLIMITED = _Deadline(math.inf, math.nan)
+"""Deadline of what completes an answer."""
+_ENDED = Event()
+"""Set once somebody has asked for the answer that there is."""
 
 
 @contextmanager
@@ -55,20 +60,28 @@ def time_limited(seconds: float | None) -> Iterator[None]:
 @contextmanager
 def time_unlimited() -> Iterator[None]:
     """Context without a limit, for what completes an answer that was found in time."""
-    token = _NEXT.set(_NONE)
+    token = _NEXT.set(_UNLIMITED)
     try:
         yield
     finally:
         _NEXT.reset(token)
 
 
+def end_search() -> None:
+    """End every search of this process as if its time were over, from any thread; what completes an answer goes on."""
+    _ENDED.set()
+
+
 def time_left() -> float:
     """Time until the limit, s; infinite where there is none."""
-    return _NEXT.get().moment - monotonic()
+    deadline = _NEXT.get()
+    return -math.inf if _ENDED.is_set() and deadline is not _UNLIMITED else deadline.moment - monotonic()
 
 
 def check_time() -> None:
     """Raise TimeLimitError where the time of a `time_limited` context is over."""
     if time_left() <= 0.0:
         limit = _NEXT.get().limit
+        if _ENDED.is_set():
+            raise TimeLimitError("the search was ended before an answer was found; let it go on for longer")
         raise TimeLimitError(f"the time limit of {limit:g} s was reached before an answer was found; give a longer one")

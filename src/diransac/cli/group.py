@@ -38,11 +38,14 @@ _MODULES = {
     "design": "design",
     "export": "results",
     "models": "inspection",
+    "studio": "studio",
     "cache": "inspection",
     "fleet": "stores",
     "study": "stores",
 }
 """Commands, in the order of ``--help``, and their modules in `diransac.cli.commands`."""
+
+_CONFIG = "--config"
 
 _VERBOSITY = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 
@@ -89,16 +92,17 @@ class Group(TyperGroup):
         return super().parse_args(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, *positional: Any, **extra: Any) -> NoReturn:
-        """Run the command line; ``--debug``, ``-q`` and ``-v`` may stand anywhere."""
+        """Run the command line; ``--debug``, ``--progress-json``, ``-q`` and ``-v`` may stand anywhere."""
         given = list(sys.argv[1:] if args is None else args)
-        words = [word for word in given if word not in ("--debug", *_VERBOSITY)]
+        words = [word for word in given if word not in ("--debug", "--progress-json", *_VERBOSITY)]
         extra["standalone_mode"] = False
         screen.set_command(given)
         levels = [_VERBOSITY[word] for word in given if word in _VERBOSITY]
         screen.set_verbosity(levels[-1] if levels else 0)
+        screen.set_for_programs("--progress-json" in given)
         debugging = "--debug" in given
         try:
-            code = super().main(words, *positional, **extra)
+            code = super().main(_configured(words), *positional, **extra)
         except UsageError as error:
             where = error.ctx.command_path if error.ctx else "diransac"
             code = _say(error.format_message(), 2, f"See '{where} --help'.")
@@ -111,6 +115,22 @@ class Group(TyperGroup):
         if code == INTERRUPTED:
             screen.note("interrupted")
         sys.exit(code or 0)
+
+
+def _configured(words: list[str]) -> list[str]:
+    """Words of ``identify`` with the options of its project file in place of ``--config FILE``, before those given."""
+    at = next((k for k, word in enumerate(words) if word.partition("=")[0] == _CONFIG), None)
+    if at is None or words[0] != "identify":
+        return words
+    _, equals, joined = words[at].partition("=")
+    rest = words[at + 1 :] if equals else words[at + 2 :]
+    name = joined if equals else next(iter(words[at + 1 :]), "")
+    if not name:
+        raise typer.BadParameter(f"{_CONFIG} needs the name of a project file")
+    from diransac.studio.project import Project
+
+    file = Path(name)
+    return [words[0], *Project.load(file).words(file.parent), *words[1:at], *rest]
 
 
 def _convert_plainly(command: Any, ctx: Any) -> None:

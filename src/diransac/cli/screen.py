@@ -7,6 +7,7 @@ import math
 import os
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import typer
 
 from diransac.identification.method import Callback, Progress
 from diransac.plain_text import one_line, printable
+from diransac.time_limit import end_search
 
 __all__ = [
     "Lines",
@@ -31,14 +33,17 @@ __all__ = [
     "progress_bar",
     "say",
     "set_command",
+    "set_for_programs",
     "set_verbosity",
     "show",
     "shows_bars",
     "stdout_taken",
 ]
 
-_STATE = {"verbosity": 0, "taken": 0}
-"""Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout."""
+_STATE = {"verbosity": 0, "taken": 0, "for_programs": 0}
+"""Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout; 1 where
+progress is for programs.
+"""
 _WORDS: list[str] = []
 """Of the same command."""
 
@@ -157,6 +162,16 @@ def set_verbosity(level: int) -> None:
     _STATE["verbosity"] = level
 
 
+def set_for_programs(is_so: bool) -> None:
+    """Set whether progress is written as JSON lines on stderr, and a line ``stop`` on stdin ends a search.
+
+    Parameters
+    ----------
+    is_so : bool
+    """
+    _STATE["for_programs"] = int(is_so)
+
+
 def is_quiet() -> bool:
     """True if there is no progress and no text."""
     return _STATE["verbosity"] < 0
@@ -210,6 +225,10 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
+    if _STATE["for_programs"]:
+        threading.Thread(target=_heed_stop, daemon=True).start()
+        yield lambda found: note(json.dumps(_finite({"label": label, **vars(found)}), ensure_ascii=False))
+        return
     if is_quiet():
         yield lambda _: None
         return
@@ -232,6 +251,13 @@ def bar(label: str) -> Iterator[Callback]:
             )
 
         yield update
+
+
+def _heed_stop() -> None:
+    """End the search at a line ``stop`` on stdin."""
+    for line in sys.stdin or ():
+        if line.strip() == "stop":
+            end_search()
 
 
 @contextmanager

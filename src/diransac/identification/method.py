@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -36,11 +36,17 @@ class Progress:
         Completed fraction of the whole work, 0 to 1; it never falls.
     note : str, optional
         Intermediate finding, or empty.
+    parameters : mapping of str to float, optional
+        Best parameters so far, in their units; empty where there are none yet.
+    residuals : mapping of str to float, optional
+        Standard deviation of the residuals of each signal with them, outliers apart, in its unit.
     """
 
     stage: str
     fraction: float
     note: str = ""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    residuals: Mapping[str, float] = field(default_factory=dict)
 
 
 Callback = Callable[[Progress], None]
@@ -180,7 +186,9 @@ def extremes(logs: Sequence[Log]) -> str:
     return f'"{name}" is {usual:.3g} in the median and {largest:.3g} at most; check its unit, and remove such outliers'
 
 
-def report(callback: Callback | None, stage: str, fraction: float, note: str = "") -> None:
+def report(
+    callback: Callback | None, stage: str, fraction: float, note: str = "", **found: Mapping[str, float]
+) -> None:
     """Call the callback, if there is one, with a `Progress`.
 
     Parameters
@@ -189,10 +197,11 @@ def report(callback: Callback | None, stage: str, fraction: float, note: str = "
     stage : str
     fraction : float
     note : str, optional
+    **found
         Fields of the `Progress`.
     """
     if callback is not None:
-        callback(Progress(stage, fraction, note))
+        callback(Progress(stage, fraction, note, **found))
 
 
 def within(callback: Callback | None, low: float, high: float, prefix: str = "") -> Callback | None:
@@ -213,4 +222,4 @@ def within(callback: Callback | None, low: float, high: float, prefix: str = "")
     """
     if callback is None:
         return None
-    return lambda x: callback(Progress(prefix + x.stage, low + (high - low) * x.fraction, x.note))
+    return lambda x: callback(replace(x, stage=prefix + x.stage, fraction=low + (high - low) * x.fraction))

@@ -23,6 +23,7 @@ __all__ = [
     "competitions",
     "diagnosis",
     "differences",
+    "interval_text",
     "lead",
     "log_tables",
     "parameters",
@@ -261,15 +262,16 @@ def _estimate(name: str, entry: Entry, look: str, scale: Scale) -> Estimate:
         label=entry.label,
         look=look,
         value=number(value, 6),
-        interval=_interval_text(low, high),
-        structural=_interval_text(*result.structural_intervals()[name]) if result.has_structure else "not tested",
+        interval=interval_text(low, high),
+        structural=interval_text(*result.structural_intervals()[name]) if result.has_structure else "not tested",
         width=width if known else "–",
         is_outside=name in result.violations,
         whisker=_whisker(name, entry, look, scale),
     )
 
 
-def _interval_text(low: float, high: float) -> str:
+def interval_text(low: float, high: float) -> str:
+    """Ends of an interval, with the digits that tell them apart."""
     digits = telling_digits(low, high)
     return f"{number(low, digits)} … {number(high, digits)}" if np.isfinite(high - low) else "unknown"
 

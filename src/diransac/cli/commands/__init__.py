@@ -27,6 +27,9 @@ def _diransac(
     _debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error, after any command.")] = False,
     _quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no text; anywhere.")] = False,
     _verbose: Annotated[bool, typer.Option("--verbose", "-v", help="A line for every stage; anywhere.")] = False,
+    _programs: Annotated[
+        bool, typer.Option("--progress-json", help="Progress as JSON lines, ended by a line stop; anywhere.")
+    ] = False,
 ) -> None:
     if version:
         from importlib.metadata import version as version_of

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -59,6 +60,12 @@ def _identify(
     horizon: Annotated[
         float | None,
         typer.Option(metavar="S", help="Time over which the model is to predict; estimates are compared over it."),
+    ] = None,
+    _config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="FILE.toml", help="A project: logs, model and options; those given besides it win."
+        ),
     ] = None,
     output: Output = None,
     report: Report = None,

@@ -8,9 +8,17 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import model_file, preparation_of
+from diransac.cli.arguments import fixed_parameters, model_file, preparation_of
 from diransac.cli.group import grouped
-from diransac.cli.options import JsonFlag, LogFile, ModelName, OptionalModelName, Preparation, output_or_stdout
+from diransac.cli.options import (
+    FixedParameters,
+    JsonFlag,
+    LogFile,
+    ModelName,
+    OptionalModelName,
+    Preparation,
+    output_or_stdout,
+)
 from diransac.cli.outputs import staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.views import CacheState, Equations, ModelList, Recorded
@@ -30,6 +38,7 @@ def _inspect(
     preparation: Preparation,
     robot: RobotOptions,
     model: OptionalModelName = None,
+    fixed: FixedParameters = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Show what a log holds, what is odd about it, and what is missing for a model."""
@@ -37,7 +46,8 @@ def _inspect(
     like = preparation_of(model)
     topics = read_topics(file)
     if topics is None or preparation.names_signals or any(step["step"] == "map" for step in like):
-        screen.show(inspect(preparation.read_uneven(file, like), plant), as_json)
+        known = fixed_parameters("--fix", fixed or ())
+        screen.show(inspect(preparation.read_uneven(file, like), plant, fixed=known), as_json)
     else:
         screen.show(Recorded.of(topics, plant), as_json)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,14 @@ from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
 from diransac.data.segment import spelling_notes
-from diransac.errors import IdentificationError, LogError
+from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.identification.evaluation.scoring import choose_scoring
 from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.regression.uncertainty import jackknife_covariance
 from diransac.identification.settings import Settings
 from diransac.identification.structure.columns import contradictions
 from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
+from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
 from diransac.identification.structure.structural import structural
 from diransac.text_table import aligned, percent
@@ -187,7 +188,9 @@ class Inspection:
         return lines + ([f"  {found.caveat}"] if found.caveat else [])
 
 
-def inspect(log: Log, model: Model | None = None) -> Inspection:
+def inspect(
+    log: Log, model: Model | None = None, *, fixed: Mapping[str, float | None] | Iterable[str] | None = None
+) -> Inspection:
     """Statistics of a log, and the identifiability of a model's parameters from it.
 
     Parameters
@@ -195,11 +198,21 @@ def inspect(log: Log, model: Model | None = None) -> Inspection:
     log : Log
     model : Model, optional
         Velocities and accelerations that the model needs and the log lacks are derived, where they can be.
+    fixed : mapping of str to float, or iterable of str, optional
+        Parameters of the model that are known, as in `identify`.
 
     Returns
     -------
     Inspection
+
+    Raises
+    ------
+    SettingsError
+        The model has no such parameter, or one is fixed without a model.
     """
+    if model is None and fixed:
+        raise SettingsError("parameters are fixed without a model; give the model, too")
+    model = None if model is None else KnownParameters.of(model, fixed, None).free()
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}

@@ -274,7 +274,8 @@ class Contest:
         best = self.comparison.best
         errors = ", ".join(f"{x:.2g}" for x in self.scores[best].errors)
         best_so_far = f"best so far: {self.candidates[best].name}, held-out errors {errors} of those of no change"
-        report(self.callback, "comparing predictions", 0.89, best_so_far)
+        parameters = dict(zip(self.dataset.layout.names, self.candidates[best].parameters.tolist(), strict=True))
+        report(self.callback, "comparing predictions", 0.89, best_so_far, parameters=parameters)
         return best
 
     @property

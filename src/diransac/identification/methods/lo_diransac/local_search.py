@@ -199,9 +199,9 @@ class LocalSearch:
     def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
-        yield flexible
+        yield self._shown(flexible, 0.35)
         best = self._accurate(self._simplest(flexible))
-        yield best
+        yield self._shown(best, 0.6)
         named = self._named(intervals)
         if named:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
@@ -215,7 +215,21 @@ class LocalSearch:
             if not found:
                 break
             best = self._accurate(min(found, key=lambda x: x.cost))
-            yield best
+            yield self._shown(best, 0.6 + 0.03 * k)
+
+    def _shown(self, found: Explanation, fraction: float) -> Explanation:
+        """The explanation itself, which is reported as the best so far."""
+        intervals, fit = found.intervals, found.refinement.fit
+        names, known = intervals.layout.names, np.atleast_1d(intervals.known.any(axis=0))
+        measured = zip(intervals.model.signals, fit.noise.sigma.tolist(), known, strict=True)
+        report(
+            self.callback,
+            "local optimisation",
+            fraction,
+            parameters=dict(zip(names, fit.shared[: len(names)].tolist(), strict=True)),
+            residuals={n: x for n, x, known in measured if known},
+        )
+        return found
 
     def _named(self, intervals: ShootingIntervals) -> list[ErrorKind]:
         """Errors of recordings that the settings name, or require of all inputs."""

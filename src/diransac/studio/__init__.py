@@ -1,0 +1,80 @@
+"""A page on this machine from logs to a calibrated model: a face of the command line, which it runs."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from diransac.errors import SettingsError
+
+__all__ = ["serve"]
+
+_LOOPBACK = "127.0.0.1"
+
+
+def serve(given: Sequence[Path], port: int, tell: Callable[[str], None]) -> None:
+    """Serve the page until Ctrl-C.
+
+    Parameters
+    ----------
+    given : sequence of Path
+        Files and folders; none: the working directory.
+    port : int
+        On the loopback address; 0: any free one.
+    tell : callable
+        Called with the address once it can be opened.
+
+    Raises
+    ------
+    LogError
+        A file does not exist.
+    SettingsError
+        A library is missing, the port is taken, or the project file is not valid.
+    """
+    try:
+        import uvicorn
+
+        from diransac.studio.app import Studio, application
+        from diransac.studio.guard import Guard
+    except ModuleNotFoundError as error:
+        raise SettingsError(f"the page needs {error.name}: pip install 'diransac[studio]'") from error
+    from diransac.studio.folders import Folders
+
+    listening = _listening(port)
+    port = listening.getsockname()[1]
+    token = secrets.token_urlsafe(24)
+    studio = Studio(Folders(given))
+    app = Guard(application(studio), token, [f"{name}:{port}" for name in (_LOOPBACK, "localhost")])
+    config = uvicorn.Config(
+        app, log_level="critical", access_log=False, ws="none", server_header=False, timeout_graceful_shutdown=1
+    )
+
+    class Server(uvicorn.Server):
+        """Server that tells when it has started, and lets go of open streams when it is to end."""
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            tell(f"http://{_LOOPBACK}:{port}/{token}/")
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            studio.ended = True
+            studio.changed()
+            await super().shutdown(sockets)
+
+    with listening:
+        Server(config).run([listening])
+
+
+def _listening(port: int) -> socket.socket:
+    """A socket on the loopback address.  Raises SettingsError: the port is taken."""
+    found = socket.socket()
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.bind((_LOOPBACK, port))
+        found.listen(64)
+    except (OSError, OverflowError) as error:
+        found.close()
+        raise SettingsError(f"port {port} of this machine is not free; give another one: --port 0") from error
+    return found

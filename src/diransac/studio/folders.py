@@ -1,0 +1,111 @@
+"""`Folders`: the files that the page may see, those below the folders that were given."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from diransac.errors import LogError
+
+__all__ = ["Folders"]
+
+_LOGS = (
+    ".csv",
+    ".csv.gz",
+    ".tsv",
+    ".txt",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".ulg",
+    ".ulog",
+    ".mcap",
+    ".bag",
+)
+_MODELS = (".urdf", ".mjcf", ".xml", ".py", ".json")
+_MOST, _DEEPEST = 2000, 5
+
+
+class Folders:
+    """Folders that were given, or those of the files that were given; the first one holds project and results.
+
+    Parameters
+    ----------
+    given : iterable of Path
+        Files and folders; none: the working directory.
+
+    Raises
+    ------
+    LogError
+        One of them does not exist.
+    """
+
+    def __init__(self, given: Iterable[Path]) -> None:
+        paths = [Path(os.path.realpath(path)) for path in given]
+        absent = next((path for path in paths if not path.exists()), None)
+        if absent is not None:
+            raise LogError(f'"{absent}" does not exist; give files or folders')
+        is_bag = [path.is_dir() and (path / "metadata.yaml").exists() for path in paths]
+        roots = [path if path.is_dir() and not bag else path.parent for path, bag in zip(paths, is_bag, strict=True)]
+        self.roots = tuple(dict.fromkeys(roots)) or (Path(os.path.realpath(Path.cwd())),)
+        self.files = tuple(path for path, root in zip(paths, roots, strict=True) if path != root)
+        """Files that were named one by one, which are the first logs of a project."""
+
+    @property
+    def first(self) -> Path:
+        """Folder of the project, to which names are relative."""
+        return self.roots[0]
+
+    def find(self, name: str) -> Path:
+        """Path of a file, by its name relative to the first folder.
+
+        Raises LogError: there is no such file below the folders, links followed.
+        """
+        try:
+            path = Path(os.path.realpath(self.first / name))
+            inside = any(path.is_relative_to(root) for root in self.roots) and path.exists()
+        except (OSError, ValueError):  # a name with a null, or too long
+            inside = False
+        if not inside:
+            raise LogError(f"{name!r:.200}: there is no such file below the folders that were given")
+        return path
+
+    def name_of(self, path: Path) -> str:
+        """Name of a file relative to the first folder."""
+        return os.path.relpath(path, self.first)
+
+    def listed(self) -> dict[str, Any]:
+        """Names and sizes of logs and models below the folders, at most 2000, and whether there are more."""
+        found: dict[str, list[dict[str, Any]]] = {"logs": [], "models": []}
+        n = 0
+        for path, is_log in self._walked():
+            n += 1
+            if n > _MOST:
+                break
+            size = path.stat().st_size if path.is_file() else 0
+            found["logs" if is_log else "models"].append({"name": self.name_of(path), "size": size})
+        return {**found, "more": n > _MOST}
+
+    def _walked(self) -> Iterator[tuple[Path, bool]]:
+        """Files that may be logs or models; a folder with a bag is a log."""
+        for root in self.roots:
+            for place, folders, files in os.walk(root):
+                folder = Path(place)
+                if "metadata.yaml" in files and folder != root:
+                    folders[:] = []
+                    yield folder, True
+                    continue
+                deep = len(folder.relative_to(root).parts) >= _DEEPEST
+                folders[:] = [] if deep else sorted(x for x in folders if x[0] != "." and x != "__pycache__")
+                for name in sorted(files):
+                    path, lower = folder / name, name.lower()
+                    if lower.endswith((*_LOGS, *_MODELS)) and self._is_inside(path):
+                        yield path, lower.endswith(_LOGS)
+
+    def _is_inside(self, path: Path) -> bool:
+        real = Path(os.path.realpath(path))
+        return real.is_file() and any(real.is_relative_to(root) for root in self.roots)
