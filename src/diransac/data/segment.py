@@ -406,7 +406,9 @@ def _unmeasured_notes(model: Model, log: Log, signals: Sequence[str]) -> list[st
     absent = [n for n in model.coordinates if n not in log]
     acting = absent and set(model.states_behind(signals))
     found = ", ".join(("t", *log.names))
-    return [f'"{n}" is not in the log, and counts as unmeasured; found {found}' for n in absent if n in acting]
+    hidden = [f'"{n}"' for n in absent if n in acting]
+    are = "is not in the log, and counts" if len(hidden) == 1 else "are not in the log, and count"
+    return [f"{', '.join(hidden)} {are} as unmeasured; found {found}"] if hidden else []
 
 
 def _row_notes(valid: BoolArray, held: BoolArray, lost: BoolArray, sampled: BoolArray) -> list[str]:

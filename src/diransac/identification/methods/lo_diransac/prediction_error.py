@@ -51,7 +51,11 @@ _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
 _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
-_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 1.0, 0.05, 3
+_NO_WORSE = 1e-4
+"""Part of the loss by which a step may raise it: contacts that begin a step earlier make it jump."""
+_BEGINNING = 8
+"""Intervals after the beginning of a log, or a gap, in which what changes a state is the beginning's."""
+_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 0.7, 0.05, 3
 """Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
 are halved."""
 _SETTLING = 4
@@ -286,7 +290,7 @@ class _Run:
         self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
         self.information, self.loss, self.lost = np.zeros((self.n, self.n)), 0.0, 0.0
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
-        self.surprise = list[FloatArray]()
+        self.surprise, self.age = list[FloatArray](), 0
         self.threads = one.threads if one.threads > 1 else default_threads()
 
     def result(self) -> Pass:
@@ -374,10 +378,11 @@ class _Run:
 
     def _count(self, w: int, update: _Update, belief: _Belief) -> None:
         """Add an interval's contributions."""
-        n_q, continues = self.predictor.intervals.model.n_q, bool(self.predictor.intervals.following[w])
+        n_q = self.predictor.intervals.model.n_q
+        self.age = self.age + 1 if self.predictor.intervals.following[w] else 0
         self.information += update.information
         self.scores[w] = update.score
-        if not continues:
+        if self.age < _BEGINNING:
             return
         self.jumps[w] = update.moved
         own = np.diag(belief.covariance)[n_q:]
@@ -505,9 +510,13 @@ def minimised(
         for _ in range(_HALVINGS):
             then, predictor = _moved(following, p, step)
             found = predictor.over_logs(then)
-            if found.loss < before + 0.01 * abs(before):
+            if found.loss < before + _NO_WORSE * abs(before):
                 break
             step = 0.5 * step
+        else:  # no step leads anywhere
+            predictor = following
+            converged = bool((np.abs(step) <= errors).all())
+            break
         p, now = then, found
     return predictor, p, now, converged
 
