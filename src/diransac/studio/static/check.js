@@ -1,55 +1,265 @@
 import { h, link, number, outcome, printed, put, run, table, unchanged } from "./page.js";
 
-const WORDS = { well: ["well determined", "is-good"], weakly: ["weakly determined", "is-care"], not: ["not determined", "is-bad"] };
+const WORDS = {
+  well: ["well determined", "is-good"],
+  weakly: ["weakly determined", "is-care"],
+  not: ["not determined", "is-bad"],
+};
 
 // What a log can tell of the model before anything is solved, and the experiment that would tell more.
 export const check = (root, now) => {
-  let asked = "", shown = "", found = null, limits = null, opened = false;
-  const status = h("div"), about = h("div"), design = h("div"), outcomeOfDesign = h("div");
-  put(root, h("h2", {}, "Check"), h("p.how", {}, "Signals, excitation, and the intervals to expect, by least squares over the first log."), status, about, design, outcomeOfDesign);
+  let asked = "",
+    shown = "",
+    found = null,
+    limits = null,
+    opened = false;
+  const status = h("div"),
+    about = h("div"),
+    design = h("div"),
+    outcomeOfDesign = h("div");
+  put(
+    root,
+    h("h2", {}, "Check"),
+    h("p.how", {}, "Signals, excitation, and the intervals to expect, by least squares over the first log."),
+    status,
+    about,
+    design,
+    outcomeOfDesign,
+  );
   const drawFound = () => {
-    const { fitness, signals, notes } = found, lacking = fitness.missing.filter((x) => !fitness.derivable.includes(x));
+    const { fitness, signals, notes } = found,
+      lacking = fitness.missing.filter((x) => !fitness.derivable.includes(x));
     const rows = Object.entries(fitness.excitation).map(([name, x]) => {
-      const [words, look] = WORDS[fitness.verdicts[name]], half = Math.abs(x.estimate * x.relative_error) * 1.96;
-      return [name, number(x.estimate), Number.isFinite(half) && x.relative_error !== null ? `${number(x.estimate - half)} … ${number(x.estimate + half)}` : "–", x.unit, x.relative_error === null ? "–" : `${number(100 * x.relative_error, 2)} %`, h(`span.${look}`, {}, words)];
+      const [words, look] = WORDS[fitness.verdicts[name]],
+        half = Math.abs(x.estimate * x.relative_error) * 1.96;
+      return [
+        name,
+        number(x.estimate),
+        Number.isFinite(half) && x.relative_error !== null
+          ? `${number(x.estimate - half)} … ${number(x.estimate + half)}`
+          : "–",
+        x.unit,
+        x.relative_error === null ? "–" : `${number(100 * x.relative_error, 2)} %`,
+        h(`span.${look}`, {}, words),
+      ];
     });
-    put(about, lacking.length > 0 && h(".card.bad", {}, h("h3", {}, "The log lacks signals"), h("p", {}, lacking.join(", ")), h("a.button", { href: "#data" }, "Choose their columns in Data")),
-      fitness.derivable.length > 0 && h("p", {}, `Not measured, estimated where it is needed: ${fitness.derivable.join(", ")}.`), fitness.reason && h(".card.care", {}, h("p", {}, fitness.reason), /fix/.test(fitness.reason) && h("a.button", { href: "#model" }, "Give known values in Model")),
-      rows.length > 0 && table(["parameter", "least squares", "interval to expect", "unit", "error", ""], rows), fitness.caveat && h("p.how", {}, fitness.caveat),
-      h("h3", {}, "Signals"), notes.length > 0 && h("ul.notes", {}, notes.map((x) => h("li", {}, x))),
-      table(["signal", "unit", "minimum", "maximum", "std", "Hz", "missing", "spikes", "frozen"], Object.entries(signals).map(([name, x]) => [name, x.unit || "?", number(x.minimum), number(x.maximum), number(x.standard_deviation), number(x.rate), String(x.n_missing || "–"), String(x.n_spikes || "–"), x.frozen ? `${number(x.frozen, 3)} s` : "–"])));
+    put(
+      about,
+      lacking.length > 0 &&
+        h(
+          ".card.bad",
+          {},
+          h("h3", {}, "The log lacks signals"),
+          h("p", {}, lacking.join(", ")),
+          h("a.button", { href: "#data" }, "Choose their columns in Data"),
+        ),
+      fitness.derivable.length > 0 &&
+        h("p", {}, `Not measured, estimated where it is needed: ${fitness.derivable.join(", ")}.`),
+      fitness.reason &&
+        h(
+          ".card.care",
+          {},
+          h("p", {}, fitness.reason),
+          /fix/.test(fitness.reason) && h("a.button", { href: "#model" }, "Give known values in Model"),
+        ),
+      rows.length > 0 &&
+        table(["parameter", "least squares", "interval to expect", "unit", "error", ""], rows),
+      fitness.caveat && h("p.how", {}, fitness.caveat),
+      h("h3", {}, "Signals"),
+      notes.length > 0 &&
+        h(
+          "ul.notes",
+          {},
+          notes.map((x) => h("li", {}, x)),
+        ),
+      table(
+        ["signal", "unit", "minimum", "maximum", "std", "Hz", "missing", "spikes", "frozen"],
+        Object.entries(signals).map(([name, x]) => [
+          name,
+          x.unit || "?",
+          number(x.minimum),
+          number(x.maximum),
+          number(x.standard_deviation),
+          number(x.rate),
+          String(x.n_missing || "–"),
+          String(x.n_spikes || "–"),
+          x.frozen ? `${number(x.frozen, 3)} s` : "–",
+        ]),
+      ),
+    );
   };
   const drawDesign = async (state) => {
     const equations = await printed(state, "model");
-    if (!equations) { put(design); return; }
+    if (!equations) {
+      put(design);
+      return;
+    }
     if (!limits) {
       limits = {};
-      for (const name of [...Object.keys(equations.inputs), ...Object.keys(equations.signals).filter((x) => !/_d+ot$/.test(x))]) {
+      for (const name of [
+        ...Object.keys(equations.inputs),
+        ...Object.keys(equations.signals).filter((x) => !/_d+ot$/.test(x)),
+      ]) {
         const x = found?.signals[name];
         const unit = equations.inputs[name] ?? equations.signals[name];
-        if (x && x.maximum > x.minimum && unit !== "1") limits[name] = [x.minimum, x.maximum].map((y) => Number(y.toPrecision(3)));
+        if (x && x.maximum > x.minimum && unit !== "1")
+          limits[name] = [x.minimum, x.maximum].map((y) => Number(y.toPrecision(3)));
       }
     }
-    const field = (name, k) => h("input", { type: "number", step: "any", value: limits[name][k], "aria-label": `${k ? "largest" : "smallest"} ${name}`, onchange: (event) => { limits[name][k] = Number(event.target.value); } });
-    const known = Object.fromEntries(Object.entries(found?.fitness.excitation || {}).filter(([, x]) => x.estimate !== null).map(([name, x]) => [name, x.estimate]));
+    const field = (name, k) =>
+      h("input", {
+        type: "number",
+        step: "any",
+        value: limits[name][k],
+        "aria-label": `${k ? "largest" : "smallest"} ${name}`,
+        onchange: (event) => {
+          limits[name][k] = Number(event.target.value);
+        },
+      });
+    const known = Object.fromEntries(
+      Object.entries(found?.fitness.excitation || {})
+        .filter(([, x]) => x.estimate !== null)
+        .map(([name, x]) => [name, x.estimate]),
+    );
     const parameters = { ...known, ...(state.project.fix || {}) };
-    put(design, h("h3", {}, "The experiment that would tell more"), h("p.how", {}, "A motion within limits from which the parameters are identified best. The limits are the ranges of the log, or those of the robot's description."),
-      !state.robot && h("details", { open: opened, ontoggle: (event) => { opened = event.target.open; } }, h("summary", {}, `Limits of ${Object.keys(limits).length} quantities`), h(".scroll", {}, h("table", {}, h("tbody", {}, Object.keys(limits).map((name) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, field(name, 0)), h("td", {}, "to"), h("td", {}, field(name, 1)), h("td", {}, h("button", { type: "button", onclick: () => { delete limits[name]; drawDesign(state); } }, "no limit")))))))),
-      h(".row", {}, h("button", { type: "button", onclick: () => run("design", { limits: state.robot ? {} : limits, parameters }) }, "Design an experiment"), outcome(state.jobs.design, "Designing, up to half a minute")));
+    put(
+      design,
+      h("h3", {}, "The experiment that would tell more"),
+      h(
+        "p.how",
+        {},
+        "A motion within limits from which the parameters are identified best. The limits are the ranges of the log, or those of the robot's description.",
+      ),
+      !state.robot &&
+        h(
+          "details",
+          {
+            open: opened,
+            ontoggle: (event) => {
+              opened = event.target.open;
+            },
+          },
+          h("summary", {}, `Limits of ${Object.keys(limits).length} quantities`),
+          h(
+            ".scroll",
+            {},
+            h(
+              "table",
+              {},
+              h(
+                "tbody",
+                {},
+                Object.keys(limits).map((name) =>
+                  h(
+                    "tr",
+                    {},
+                    h("th", { scope: "row" }, name),
+                    h("td", {}, field(name, 0)),
+                    h("td", {}, "to"),
+                    h("td", {}, field(name, 1)),
+                    h(
+                      "td",
+                      {},
+                      h(
+                        "button",
+                        {
+                          type: "button",
+                          onclick: () => {
+                            delete limits[name];
+                            drawDesign(state);
+                          },
+                        },
+                        "no limit",
+                      ),
+                    ),
+                  ),
+                ),
+              ),
+            ),
+          ),
+        ),
+      h(
+        ".row",
+        {},
+        h(
+          "button",
+          { type: "button", onclick: () => run("design", { limits: state.robot ? {} : limits, parameters }) },
+          "Design an experiment",
+        ),
+        outcome(state.jobs.design, "Designing, up to half a minute"),
+      ),
+    );
   };
   const drawDesigned = async (state) => {
     const made = await printed(state, "design");
-    put(outcomeOfDesign, made && [table(["parameter", "standard error to expect", "with plain sines", "unit"], Object.entries(made.parameters).map(([name, x]) => [name, number(x.standard_error, 3), number(x.multisine_standard_error, 3), x.unit])),
-      h("p", {}, h("a.button", { href: link("download", { name: "experiment.csv" }) }, "Download experiment.csv"))]);
+    put(
+      outcomeOfDesign,
+      made && [
+        table(
+          ["parameter", "standard error to expect", "with plain sines", "unit"],
+          Object.entries(made.parameters).map(([name, x]) => [
+            name,
+            number(x.standard_error, 3),
+            number(x.multisine_standard_error, 3),
+            x.unit,
+          ]),
+        ),
+        h(
+          "p",
+          {},
+          h("a.button", { href: link("download", { name: "experiment.csv" }) }, "Download experiment.csv"),
+        ),
+      ],
+    );
   };
   return async (state) => {
-    const wanted = state.commands.check.shell, job = state.jobs.check, ready = !wanted.startsWith("#") && (!state.code || state.code.confirmed);
-    if (!ready) { unchanged(status); shown = ""; put(status, h(".empty", {}, wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.")); put(about); return; }
-    if (asked !== wanted && (!job || job.command !== wanted)) { asked = wanted; run("check"); }
-    if (!unchanged(status, job?.number, job?.status)) put(status, outcome(job, "Reading the log and counting what it can tell"), h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")));
+    const wanted = state.commands.check.shell,
+      job = state.jobs.check,
+      ready = !wanted.startsWith("#") && (!state.code || state.code.confirmed);
+    if (!ready) {
+      unchanged(status);
+      shown = "";
+      put(
+        status,
+        h(
+          ".empty",
+          {},
+          wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.",
+        ),
+      );
+      put(about);
+      return;
+    }
+    if (asked !== wanted && (!job || job.command !== wanted)) {
+      asked = wanted;
+      run("check");
+    }
+    if (!unchanged(status, job?.number, job?.status))
+      put(
+        status,
+        outcome(job, "Reading the log and counting what it can tell"),
+        h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")),
+      );
     if (job?.status === "failed") put(about);
-    if (job?.status === "done" && job.command === wanted && shown !== `${job.number}`) { shown = `${job.number}`; found = await printed(state, "check"); limits = null; drawFound(); }
-    if (!unchanged(design, job?.number, job?.status, state.jobs.model?.status, state.jobs.design?.number, state.jobs.design?.status, state.project.fix, Boolean(found))) await drawDesign(state);
+    if (job?.status === "done" && job.command === wanted && shown !== `${job.number}`) {
+      shown = `${job.number}`;
+      found = await printed(state, "check");
+      limits = null;
+      drawFound();
+    }
+    if (
+      !unchanged(
+        design,
+        job?.number,
+        job?.status,
+        state.jobs.model?.status,
+        state.jobs.design?.number,
+        state.jobs.design?.status,
+        state.project.fix,
+        Boolean(found),
+      )
+    )
+      await drawDesign(state);
     drawDesigned(state);
   };
 };

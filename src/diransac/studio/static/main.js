@@ -6,34 +6,94 @@ import { solve } from "./solve.js";
 import { results } from "./results.js";
 import { use } from "./use.js";
 
-const STAGES = { data: ["Data", data], model: ["Model", model], check: ["Check", check], solve: ["Solve", solve], results: ["Results", results], use: ["Use", use] };
+const STAGES = {
+  data: ["Data", data],
+  model: ["Model", model],
+  check: ["Check", check],
+  solve: ["Solve", solve],
+  results: ["Results", results],
+  use: ["Use", use],
+};
 const JOBS = { model: "model", check: "check", solve: "solve", results: "validate", use: "export" };
-let state = null, shown = null, update = () => {}, language = "shell", asked = "";
+let state = null,
+  shown = null,
+  update = () => {},
+  language = "shell",
+  asked = "";
 const chosen = () => (location.hash.slice(1) in STAGES ? location.hash.slice(1) : "data");
 
 const look = (key) => {
-  const { project, jobs, results: found } = state, job = jobs[JOBS[key]];
+  const { project, jobs, results: found } = state,
+    job = jobs[JOBS[key]];
   if (job && (job.status === "running" || job.status === "failed")) return job.status;
   if (key === "data") return (project.logs || []).length ? "done" : "";
   if (key === "model") return job && job.status === "done" ? "done" : project.model ? "care" : "";
   if (key === "solve") return found.length ? (state.stale ? "care" : "done") : "";
   return job && job.status === "done" ? "done" : "";
 };
-const drawNav = () => unchanged(document.getElementById("stages"), chosen(), Object.keys(STAGES).map(look)) || put(document.getElementById("stages"), Object.entries(STAGES).map(([key, [name]]) => {
-  const link = h("a", { href: `#${key}`, className: look(key) }, h("i"), name);
-  if (key === chosen()) link.setAttribute("aria-current", "page");
-  return link;
-}));
+const drawNav = () =>
+  unchanged(document.getElementById("stages"), chosen(), Object.keys(STAGES).map(look)) ||
+  put(
+    document.getElementById("stages"),
+    Object.entries(STAGES).map(([key, [name]]) => {
+      const link = h("a", { href: `#${key}`, className: look(key) }, h("i"), name);
+      if (key === chosen()) link.setAttribute("aria-current", "page");
+      return link;
+    }),
+  );
 const drawCommands = () => {
-  const commands = state.commands[chosen()], text = clean(commands[language]);
+  const commands = state.commands[chosen()],
+    text = clean(commands[language]);
   if (unchanged(document.getElementById("commands"), text, language)) return;
-  const tab = (key, name) => h("button", { type: "button", "aria-pressed": String(language === key), onclick: () => { language = key; drawCommands(); } }, name);
-  const copy = h("button", { type: "button", onclick: async () => { await navigator.clipboard.writeText(text).catch(() => say("the browser does not allow copying; select the text")); copy.textContent = "Copied"; } }, "Copy");
-  put(document.getElementById("commands"), h(".row", {}, h("span", {}, "The same by hand:"), tab("shell", "Command line"), tab("python", "Python"), copy), h("pre", { tabIndex: 0 }, h("code", {}, text)));
+  const tab = (key, name) =>
+    h(
+      "button",
+      {
+        type: "button",
+        "aria-pressed": String(language === key),
+        onclick: () => {
+          language = key;
+          drawCommands();
+        },
+      },
+      name,
+    );
+  const copy = h(
+    "button",
+    {
+      type: "button",
+      onclick: async () => {
+        await navigator.clipboard
+          .writeText(text)
+          .catch(() => say("the browser does not allow copying; select the text"));
+        copy.textContent = "Copied";
+      },
+    },
+    "Copy",
+  );
+  put(
+    document.getElementById("commands"),
+    h(
+      ".row",
+      {},
+      h("span", {}, "The same by hand:"),
+      tab("shell", "Command line"),
+      tab("python", "Python"),
+      copy,
+    ),
+    h("pre", { tabIndex: 0 }, h("code", {}, text)),
+  );
 };
 const readModel = () => {
-  const wanted = state.commands.model.shell, job = state.jobs.model;
-  if (asked === wanted || !state.project.model || (job && job.command === wanted) || (state.code && !state.code.confirmed)) return;
+  const wanted = state.commands.model.shell,
+    job = state.jobs.model;
+  if (
+    asked === wanted ||
+    !state.project.model ||
+    (job && job.command === wanted) ||
+    (state.code && !state.code.confirmed)
+  )
+    return;
   asked = wanted;
   run("model");
 };
@@ -57,7 +117,8 @@ const draw = () => {
 };
 addEventListener("hashchange", draw);
 
-const LOOKS = { "light dark": "◐", light: "☀", dark: "☾" }, looks = document.getElementById("look");
+const LOOKS = { "light dark": "◐", light: "☀", dark: "☾" },
+  looks = document.getElementById("look");
 const setLook = (scheme) => {
   document.documentElement.style.colorScheme = scheme;
   localStorage.setItem("look", scheme);
@@ -71,7 +132,17 @@ looks.addEventListener("click", () => {
 setLook(localStorage.getItem("look") in LOOKS ? localStorage.getItem("look") : "light dark");
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => dispatchEvent(new Event("look")));
 
-const events = new EventSource("api/events"), connection = document.getElementById("connection");
-events.addEventListener("open", () => { connection.className = ""; put(connection, "connected"); });
-events.addEventListener("error", () => { connection.className = "lost"; put(connection, "connection lost; trying again – is diransac studio still running?"); });
-events.addEventListener("message", (event) => { state = JSON.parse(event.data); draw(); });
+const events = new EventSource("api/events"),
+  connection = document.getElementById("connection");
+events.addEventListener("open", () => {
+  connection.className = "";
+  put(connection, "connected");
+});
+events.addEventListener("error", () => {
+  connection.className = "lost";
+  put(connection, "connection lost; trying again – is diransac studio still running?");
+});
+events.addEventListener("message", (event) => {
+  state = JSON.parse(event.data);
+  draw();
+});

@@ -1,6 +1,9 @@
 // Elements, requests and text that all stages share. Text of files reaches the page as text nodes alone.
 const HIDDEN = /[\u0000-\u001f\u007f-\u009f\u00ad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]/g;
-export const clean = (text) => String(text).replace(HIDDEN, (x) => (x === "\n" ? x : `\\u${x.charCodeAt(0).toString(16).padStart(4, "0")}`));
+export const clean = (text) =>
+  String(text).replace(HIDDEN, (x) =>
+    x === "\n" ? x : `\\u${x.charCodeAt(0).toString(16).padStart(4, "0")}`,
+  );
 
 export const h = (name, about = {}, ...children) => {
   const [tag, ...classes] = name.split(".");
@@ -22,7 +25,8 @@ export const put = (element, ...children) => {
 // What is shown is drawn again only where it is another, so that no menu closes under the hand.
 const drawn = new WeakMap();
 export const unchanged = (element, ...about) => {
-  const key = JSON.stringify(about), same = drawn.get(element) === key && element.childNodes.length > 0;
+  const key = JSON.stringify(about),
+    same = drawn.get(element) === key && element.childNodes.length > 0;
   drawn.set(element, key);
   return same;
 };
@@ -34,11 +38,18 @@ const answer = async (response) => {
 };
 const address = (name, query) => `api/${name}${query ? `?${new URLSearchParams(query)}` : ""}`;
 export const get = async (name, query) => (await answer(await fetch(address(name, query)))).json();
-export const numbers = async (name, query, signal) => (await answer(await fetch(address(name, query), { signal }))).arrayBuffer();
+export const numbers = async (name, query, signal) =>
+  (await answer(await fetch(address(name, query), { signal }))).arrayBuffer();
 export const link = address;
 export const post = async (name, body) => {
   try {
-    await answer(await fetch(`api/${name}`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }));
+    await answer(
+      await fetch(`api/${name}`, {
+        method: "POST",
+        headers: { "content-type": "application/json" },
+        body: JSON.stringify(body),
+      }),
+    );
     return true;
   } catch (error) {
     say(error.message);
@@ -51,21 +62,61 @@ export const say = (text) => {
   put(box, text);
   box.hidden = !text;
   clearTimeout(fading);
-  fading = setTimeout(() => { box.hidden = true; }, 9000);
+  fading = setTimeout(() => {
+    box.hidden = true;
+  }, 9000);
 };
 export const change = (changes) => post("project", changes);
 export const run = (kind, given = {}) => post("run", { kind, ...given });
 
 export const number = (x, digits = 4) => {
   if (x === null || x === undefined || Number.isNaN(x)) return "–";
-  const text = Math.abs(x) >= 1e5 || (x !== 0 && Math.abs(x) < 1e-3) ? x.toExponential(digits - 1) : String(+x.toPrecision(digits));
+  const text =
+    Math.abs(x) >= 1e5 || (x !== 0 && Math.abs(x) < 1e-3)
+      ? x.toExponential(digits - 1)
+      : String(+x.toPrecision(digits));
   return text.replace(/-/g, "−");
 };
-export const table = (header, rows, caption) => h(".scroll", {}, h("table", {}, caption && h("caption", {}, caption),
-  h("thead", {}, h("tr", {}, header.map((x) => h("th", { scope: "col" }, x)))),
-  h("tbody", {}, rows.map((row) => h("tr", {}, row.map((x, k) => (k ? h(typeof x === "string" && /^[−\d–]/.test(x) ? "td.number" : "td", {}, x) : h("th", { scope: "row" }, x))))))));
+export const table = (header, rows, caption) =>
+  h(
+    ".scroll",
+    {},
+    h(
+      "table",
+      {},
+      caption && h("caption", {}, caption),
+      h(
+        "thead",
+        {},
+        h(
+          "tr",
+          {},
+          header.map((x) => h("th", { scope: "col" }, x)),
+        ),
+      ),
+      h(
+        "tbody",
+        {},
+        rows.map((row) =>
+          h(
+            "tr",
+            {},
+            row.map((x, k) =>
+              k
+                ? h(typeof x === "string" && /^[−\d–]/.test(x) ? "td.number" : "td", {}, x)
+                : h("th", { scope: "row" }, x),
+            ),
+          ),
+        ),
+      ),
+    ),
+  );
 export const choice = (value, options, about) => {
-  const element = h("select", about, options.map(([key, text]) => h("option", { value: key }, text)));
+  const element = h(
+    "select",
+    about,
+    options.map(([key, text]) => h("option", { value: key }, text)),
+  );
   element.value = value;
   return element;
 };
@@ -74,7 +125,8 @@ const known = {};
 export const printed = async (state, kind) => {
   const job = state.jobs[kind];
   if (!job || job.status !== "done") return null;
-  if (!known[kind] || known[kind].number !== job.number) known[kind] = { number: job.number, printed: get("job", { kind }).then((x) => x.printed) };
+  if (!known[kind] || known[kind].number !== job.number)
+    known[kind] = { number: job.number, printed: get("job", { kind }).then((x) => x.printed) };
   return known[kind].printed;
 };
 export const outcome = (job, busy) => {
