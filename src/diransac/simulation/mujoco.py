@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import SettingsError
 from diransac.model.mjcf.model import write
-from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.description import mujoco_module, without_warnings
 from diransac.simulation.batch import (
     ClosedLoopBatch,
     GaussNewtonBatch,
@@ -356,9 +356,9 @@ class _Pool:
             self._data = sizes, [module.MjData(one) for _ in range(max(1, self._threads))]
         n, n_steps = control.shape[:2]
         state, sensordata = np.empty((n, n_steps, begin.shape[1])), np.empty((n, n_steps, one.nsensordata))
-        self._rollout.rollout(
-            models, self._data[1], begin, control, control_spec=spec, nstep=n_steps, state=state, sensordata=sensordata
-        )
+        outputs = {"state": state, "sensordata": sensordata}
+        with without_warnings():  # of states that diverge, which MuJoCo writes into a file
+            self._rollout.rollout(models, self._data[1], begin, control, control_spec=spec, nstep=n_steps, **outputs)
         return state, sensordata
 
 
