@@ -251,7 +251,7 @@ def test_a_base_that_nothing_measures_is_followed(hopper_file: Path) -> None:
     names |= {f"acc_{x}": (lambda d, k=k: d.sensordata[k], 0.1) for k, x in enumerate("xyz")}
     names |= {f"gyro_{x}": (lambda d, k=k: d.sensordata[3 + k], 5e-3) for k, x in enumerate("xyz")}
     phases = np.array([0.0, 1.5, 2.5, 4.0])
-    log = recorded(hopper(1.2, 0.04, 0.8, 20.0), lambda t: 0.02 * np.sin(9.0 * t + phases), 2.0, names, 2)
+    log = recorded(hopper(1.2, 0.04, 0.8, 20.0), lambda t: 0.02 * np.sin(9.0 * t + phases), 3.0, names, 2)
     model = dr.models.mujoco(hopper_file, unknown=["body/payload.mass", "body/payload.ipos[0]"])
     result = dr.identify(model, log)
     assert result.parameters["body/payload.mass"] == pytest.approx(1.2, rel=0.02)

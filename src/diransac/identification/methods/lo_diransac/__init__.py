@@ -6,7 +6,7 @@
 | `method.py` | `LoDiransac`: the steps in their order |
 | `smoothing.py` | screening of samples, and the motion without a model |
 | `hypotheses.py` | samples in weak form, consensus |
-| `without_equations.py`, `prediction_error.py` | estimates of models that a simulator alone knows |
+| `without_equations.py`, `following.py`, `prediction_error.py` | estimates of models that a simulator alone knows |
 | `augmented_model.py` | the model with discrepancies |
 | `shooting.py` | logs as intervals, each a rollout of the augmented model |
 | `mixture.py` | noise: a Gaussian and outliers |

@@ -18,7 +18,8 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.prediction_error import Pass, Predictor, minimised, settled
+from diransac.identification.methods.lo_diransac.following import Pass, Predictor
+from diransac.identification.methods.lo_diransac.prediction_error import minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
 
 if TYPE_CHECKING:
