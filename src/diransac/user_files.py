@@ -6,19 +6,27 @@ Stdout is for results and stderr for a few lines; text that a user's own code pr
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import runpy
 import sys
 import threading
 import traceback
+import types
 from collections.abc import Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from diransac.errors import DiransacError, ModelError
 
-__all__ = ["blaming", "definitions", "file_and_name", "in_words", "leave_stdout", "running", "silenced"]
+__all__ = ["CONFIRMED", "blaming", "definitions", "file_and_name", "in_words", "leave_stdout", "running", "silenced"]
+
+CONFIRMED = "DIRANSAC_CODE_SHA256"
+"""Environment variable with the SHA-256 of the only code that may be run, empty for none; any code where it is not set.
+
+The studio sets it for its commands.
+"""
 
 _ALONE = threading.RLock()
 """Held without output, and while users' code runs, which may run more of it: threads share stdout and stderr."""
@@ -51,7 +59,30 @@ def definitions(file: Path, what: str) -> Mapping[str, object]:
     if not file.is_file():
         raise ModelError(f'{what} file "{file}" does not exist; give a built-in name or file.py[:name]')
     with running(file, what):
-        return runpy.run_path(str(file), run_name=f"diransac_{what}_file")
+        name, confirmed = f"diransac_{what}_file", os.environ.get(CONFIRMED)
+        return runpy.run_path(str(file), run_name=name) if confirmed is None else _confirmed(file, name, confirmed)
+
+
+def _confirmed(file: Path, name: str, digest: str) -> Mapping[str, object]:
+    """Objects that a file defines whose bytes have a digest; those bytes are run, whatever the file has become since.
+
+    Raises ModelError: it has another digest.
+    """
+    content = file.read_bytes()
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ModelError("it is not the program that was confirmed; read and confirm it again")
+    module = types.ModuleType(name)
+    module.__file__ = str(file)
+    before = sys.modules.get(name)
+    sys.modules[name] = module  # where pickles and dataclasses look for it
+    try:
+        exec(compile(content, str(file), "exec", dont_inherit=True), vars(module))  # noqa: S102  # it is confirmed
+    finally:
+        if before is None:
+            del sys.modules[name]
+        else:
+            sys.modules[name] = before
+    return dict(vars(module))
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from diransac.errors import DiransacError, LogError, SettingsError
+from diransac.limits import read_bytes
 from diransac.plain_text import one_line, printable
 from diransac.studio.folders import Folders
 from diransac.studio.jobs import Jobs
@@ -34,6 +35,8 @@ __all__ = ["Studio", "application"]
 _STATIC = Path(__file__).parent / "static"
 _KEEP_ALIVE = 5.0
 _MOST_CELLS = 4000
+_MOST_SHOWN = 100_000
+"""Characters of a program that is shown to be confirmed."""
 _OF_RESULT = {
     *("parameters", "units", "fixed", "intervals_95", "structural_intervals_95", "verdict", "findings", "suggestions"),
 }
@@ -56,6 +59,7 @@ class Studio:
         self.jobs = Jobs(folders.first, self.changed)
         self.version, self._news, self.ended = 0, asyncio.Event(), False
         self._confirmed = set[tuple[str, str]]()
+        self._digests = dict[Path, tuple[tuple[int, int], str]]()
         self._solved: dict[str, Any] | None = None
 
     def _solvable(self) -> dict[str, Any]:
@@ -107,18 +111,40 @@ class Studio:
         return [f"{RESULTS}/{name}" for name in names]
 
     def code(self) -> tuple[str, str] | None:
-        """Name and digest of the user's own code that the model is; None for any other model."""
+        """Name and digest of the user's own code that the model is; None for any other model.
+
+        The digest is empty where the code cannot be shown.
+        """
         if not self.project.code:
             return None
         try:
-            content = self.folders.find(self.project.code).read_bytes()
-        except (LogError, OSError):
-            content = b""
-        return self.project.code, hashlib.sha256(content).hexdigest()
+            path = self.folders.find(self.project.code)
+            about = path.stat()
+            as_of = about.st_mtime_ns, about.st_size
+            if self._digests.get(path, (None, ""))[0] != as_of:
+                self._digests[path] = as_of, self.code_shown()[0]
+            return self.project.code, self._digests[path][1]
+        except (DiransacError, OSError):
+            return self.project.code, ""
+
+    def code_shown(self) -> tuple[str, str]:
+        """Digest and text of the user's own code, from one reading.
+
+        Raises LogError, OSError: it is not there; SettingsError: it is too long to be shown.
+        """
+        name = self.project.code
+        try:
+            content = read_bytes(self.folders.find(name), 4 * _MOST_SHOWN)
+        except ValueError:
+            content = b"#" * (_MOST_SHOWN + 1)
+        text = content.decode("utf-8", errors="replace")
+        if len(text) > _MOST_SHOWN:
+            raise SettingsError(f"{name} has more than {_MOST_SHOWN:,} characters; move parts of it to other files")
+        return hashlib.sha256(content).hexdigest(), text
 
     def confirm(self, name: object, digest: object) -> None:
         """Allow the user's code to be run.  Raises SettingsError: it is other code than was shown."""
-        if self.code() != (name, digest):
+        if not digest or self.code() != (name, digest):
             raise SettingsError("the file has changed since it was shown; read it again")
         self._confirmed.add((str(name), str(digest)))
         self.changed()
@@ -142,11 +168,12 @@ class Studio:
                 self.shown(name)
 
     def check_files(self, project: Project) -> None:
-        """Raise LogError: a file of a project is not below the folders that were given."""
+        """Raise LogError, ModelError: a file of a project is not below the folders that were given."""
         model = project.code or (project.model if Path(project.model or "").suffix else None)
-        mapping = project.mapping if (project.mapping or "").endswith(".toml") else None
-        for name in filter(None, (*project.logs, *project.held_out, model, mapping)):
+        for name in filter(None, (*project.logs, *project.held_out, model, project.mapping_file)):
             self.folders.find(name)
+        if project.model is not None and project.names_robot:
+            self.folders.find_description(project.model)
 
     async def run(self, kind: str, given: Mapping[str, Any]) -> None:
         """Begin a job.  Raises SettingsError, LogError: it lacks something, or has no right to it."""
@@ -155,21 +182,29 @@ class Studio:
         if isinstance(given.get("log"), str):
             self.folders.find(given["log"])
         code = self.code()
-        if code is not None and kind in CALLS_CODE and code not in self._confirmed:
+        confirmed = code[1] if code in self._confirmed and code is not None else ""
+        if code is not None and kind in CALLS_CODE and not confirmed:
             raise SettingsError(f"{code[0]} is a program, which would be run; confirm that first, in Model")
+        self._check_results()
         if kind == "solve":
             self.project.save(self.file)
             self._solved = self._solvable()
         (self.folders.first / RESULTS).mkdir(exist_ok=True)
-        await self.jobs.start(kind, words, as_json=kind not in ("predict", "export"))
+        await self.jobs.start(kind, words, as_json=kind not in ("predict", "export"), confirmed=confirmed)
+
+    def _check_results(self) -> None:
+        """Raise SettingsError: results would be written through a link, to wherever it leads."""
+        folder = self.folders.first / RESULTS
+        if folder.is_symlink() or any(path.is_symlink() for path in folder.rglob("*")):
+            raise SettingsError(f"{RESULTS} is or has a link, through which results would be written; remove it")
 
     def shown(self, name: str) -> Shown:
         """A log of the project as far as it can be read."""
         options = dict(self.project.options)
         known = ("mapping", "columns", "rate", "repair", "scale", "resample", "unmeasured")
         reading = {key: options[key] for key in known if key in options}
-        if reading.get("mapping", "").endswith(".toml"):
-            reading["mapping"] = str(self.folders.find(reading["mapping"]))
+        if self.project.mapping_file:
+            reading["mapping"] = str(self.folders.find(self.project.mapping_file))
         if options.get("map"):
             reading["rename"] = options["map"]
         return self.logs.read(self.folders.find(name), reading)
@@ -243,11 +278,11 @@ async def _confirm(studio: Studio, request: Request) -> Response:
 
 
 async def _code(studio: Studio, _request: Request) -> Response:
-    code = studio.code()
-    if code is None:
+    name = studio.project.code
+    if not name:
         return Response(status_code=404)
-    text = studio.folders.find(code[0]).read_text(encoding="utf-8", errors="replace")
-    return _answer({"name": code[0], "sha256": code[1], "text": text[:100_000]})
+    digest, text = studio.code_shown()
+    return _answer({"name": name, "sha256": digest, "text": text})
 
 
 async def _log(studio: Studio, request: Request) -> Response:
@@ -315,6 +350,8 @@ async def _report(studio: Studio, request: Request) -> Response:
 async def _download(studio: Studio, request: Request) -> Response:
     name = request.query_params["name"]
     path = studio.folders.find(f"{RESULTS}/{Path(name).name}")
+    if not path.is_file():
+        raise LogError("there is no such file among the results")
     return FileResponse(path, filename=path.name, media_type="application/octet-stream")
 
 
@@ -322,7 +359,7 @@ async def _scene(studio: Studio, request: Request) -> Response:
     query, project = request.query_params, studio.project
     if project.model is None:
         raise SettingsError("there is no model yet; choose one")
-    path = str(studio.folders.find(project.model)) if project.names_robot else None
+    path = str(studio.folders.find_description(project.model)) if project.names_robot else None
     measured = await run_in_threadpool(studio.shown, query["name"]) if query.get("name") else None
     predicted = None
     if "predicted" in query:
@@ -383,7 +420,7 @@ def _endpoint(studio: Studio, call: Endpoint) -> Callable[[Request], Awaitable[R
             return await call(studio, request)
         except (DiransacError, OSError) as error:
             return _answer({"error": str(error)}, 400)
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, ArithmeticError) as error:
             return _answer({"error": f"the request is not understood: {error!r:.100}"}, 400)
 
     return answered

@@ -6,8 +6,10 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
-from diransac.errors import LogError
+from diransac.errors import LogError, ModelError
+from diransac.limits import LARGEST_TABLE, read_bytes
 
 __all__ = ["Folders"]
 
@@ -63,16 +65,44 @@ class Folders:
     def find(self, name: str) -> Path:
         """Path of a file, by its name relative to the first folder.
 
-        Raises LogError: there is no such file below the folders, links followed.
+        Raises LogError: there is no such file below the folders, links followed, or it is a folder with others.
         """
         try:
             path = Path(os.path.realpath(self.first / name))
-            inside = any(path.is_relative_to(root) for root in self.roots) and path.exists()
+            inside = self._holds(path) and path.exists()
         except (OSError, ValueError):  # a name with a null, or too long
             inside = False
         if not inside:
             raise LogError(f"{name!r:.200}: there is no such file below the folders that were given")
+        for place, folders, files in os.walk(path):  # a recording or data set, whose readers open what is in it
+            linked = next((x for x in folders if Path(place, x).is_symlink()), None)
+            strange = next((x for x in files if not self._holds(Path(os.path.realpath(Path(place, x))))), linked)
+            if strange is not None:
+                raise LogError(f"{name!r:.200}: {strange!r:.200} in it is a link that leaves it; put a copy there")
         return path
+
+    def find_description(self, name: str) -> Path:
+        """Path of a robot's description, as `find`.
+
+        Raises LogError: as there; ModelError: it takes in a description that is not below the folders.
+        """
+        path = self.find(name)
+        known, left = {path}, [path]
+        while left:
+            file = left.pop()
+            for other in _taken_in(file, name):
+                # MuJoCo looks beside the first file, beside the one that names the other, and where it runs.
+                places = {Path(os.path.realpath(x / other)) for x in (path.parent, file.parent, self.first, Path.cwd())}
+                found = {x for x in places if x.exists()}
+                if not all(map(self._holds, found)):
+                    raise ModelError(f"{name!r:.200} includes {other!r:.200}, which is not below the given folders")
+                left += found - known
+                known |= found
+        return path
+
+    def _holds(self, real: Path) -> bool:
+        """Whether a path without links is below the folders."""
+        return any(real.is_relative_to(root) for root in self.roots)
 
     def name_of(self, path: Path) -> str:
         """Name of a file relative to the first folder."""
@@ -108,4 +138,24 @@ class Folders:
 
     def _is_inside(self, path: Path) -> bool:
         real = Path(os.path.realpath(path))
-        return real.is_file() and any(real.is_relative_to(root) for root in self.roots)
+        return real.is_file() and self._holds(real)
+
+
+def _taken_in(file: Path, label: str) -> list[str]:
+    """Names of descriptions that one takes in.  Raises ModelError: it cannot be read, or they cannot be told."""
+    parser, found = expat.ParserCreate(), list[str]()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag in ("include", "model") and "file" in attributes:
+            found.append(attributes["file"])
+
+    parser.StartElementHandler = start
+    try:
+        content = read_bytes(file, 64 * LARGEST_TABLE)
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        if b"include" in content or b"<model" in content:  # MuJoCo is less strict, and might take them in
+            raise ModelError(f"{label!r:.200} is no XML: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ModelError(f"{label!r:.200} cannot be read: {error}") from error
+    return found

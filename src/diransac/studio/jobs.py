@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from diransac.studio.project import quoted
+from diransac.user_files import CONFIRMED
 
 __all__ = ["Job", "Jobs"]
 
@@ -79,7 +81,7 @@ class Jobs:
         self._tasks, self._one_at_a_time = set[asyncio.Task[None]](), asyncio.Lock()
         self.latest = dict[str, Job]()
 
-    async def start(self, kind: str, words: Sequence[str], *, as_json: bool = True) -> Job:
+    async def start(self, kind: str, words: Sequence[str], *, as_json: bool = True, confirmed: str = "") -> Job:
         """Begin a command.
 
         Parameters
@@ -89,22 +91,30 @@ class Jobs:
             After the program's name.
         as_json : bool
             Whether the command prints JSON.
+        confirmed : str
+            SHA-256 of the only user's code that it may run; empty: none.
+
+        Raises
+        ------
+        OSError
+            The system starts no such process; the kind has no new job then.
         """
         async with self._one_at_a_time:
             await self.stop(kind, at_once=True)
-            self._count += 1
-            job = self.latest[kind] = Job(list(words), self._count)
             more = ["--json", "--progress-json"] if as_json else []
             # Paths are given by the words alone: no module beside the logs is imported.
-            job.process = await asyncio.create_subprocess_exec(
+            process = await asyncio.create_subprocess_exec(
                 *[sys.executable, "-P", "-m", "diransac", *words, *more],
                 cwd=self._folder,
-                env={**os.environ, "PYTHONSAFEPATH": "1"},
+                env={**os.environ, "PYTHONSAFEPATH": "1", CONFIRMED: confirmed},
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.PIPE,
                 limit=_LONGEST_LINE,
+                start_new_session=True,
             )
+            self._count += 1
+            job = self.latest[kind] = Job(list(words), self._count, process=process)
         task = asyncio.create_task(self._follow(job, as_json=as_json))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -119,7 +129,7 @@ class Jobs:
         with suppress(ProcessLookupError, ConnectionError):  # it has just ended
             if at_once:
                 job.status = "stopped"
-                job.process.kill()
+                _kill(job.process)
                 await job.process.wait()
             elif job.process.stdin is not None:
                 job.process.stdin.write(b"stop\n")
@@ -152,13 +162,22 @@ class Jobs:
     async def _progress(self, job: Job, stream: asyncio.StreamReader) -> list[str]:
         """Keep the progress of a job; other lines."""
         said = list[str]()
-        while line := (await stream.readline()).decode(errors="replace").rstrip():
+        while raw := await stream.readline():
+            line = raw.decode(errors="replace").rstrip()
             try:
                 step = json.loads(line)
             except ValueError:
-                said.append(line)
+                said += [line] if line else []
                 continue
             if isinstance(step, dict):
                 job.steps = [*job.steps, step | {"seconds": time.monotonic() - job.began}][-_MOST_STEPS:]
                 self._changed()
         return said
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    """End a command and the processes that it has started.  Raises ProcessLookupError: there are none."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)  # its own group, by its session
+    else:
+        process.kill()

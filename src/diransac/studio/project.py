@@ -6,6 +6,7 @@ command line makes of it, and which Python does the same.
 
 from __future__ import annotations
 
+import keyword
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from diransac.atomic import write_text
 from diransac.errors import ResultError, SettingsError
 from diransac.plain_data import toml_file
 from diransac.plain_text import literal, one_line, printable
+from diransac.user_files import file_and_name
 
 __all__ = ["NAME", "Project", "printed", "quoted"]
 
@@ -34,8 +36,7 @@ _SEARCH = [
 ]
 _LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies"}
 """Options whose value is one text with commas."""
-_FILES = ("mapping",)
-"""Options that may name a file beside the project."""
+_DESCRIPTIONS = (".xml", ".mjcf", ".urdf")
 
 
 def _hyphened(name: str) -> str:
@@ -126,13 +127,20 @@ class Project(BaseModel):
     @property
     def names_robot(self) -> bool:
         """True for a model from a description, which alone takes options of a robot."""
-        return Path(self.model or "").suffix.lower() in (".xml", ".mjcf", ".urdf")
+        return Path(self.model or "").suffix.lower() in _DESCRIPTIONS
 
     @property
     def code(self) -> str:
         """The file of the user's own code that the model is, or an empty text."""
-        file = (self.model or "").partition(".py")
-        return f"{file[0]}.py" if file[1] and (not file[2] or file[2].startswith(":")) else ""
+        found = _code_and_name(self.model or "")
+        return "" if found is None else str(found[0])
+
+    @property
+    def mapping_file(self) -> str:
+        """The file that the mapping is, or an empty text for a built-in one."""
+        from diransac.data.mapping_file import BUILT_IN
+
+        return "" if self.mapping is None or self.mapping in BUILT_IN else self.mapping
 
     def words_of_reading(self, folder: Path = Path()) -> list[str]:
         """Options of the preparation of a log."""
@@ -160,7 +168,8 @@ class Project(BaseModel):
             if key in options:
                 named = f"--{'set' if key == 'settings' else key}"
                 for text in _texts(key, options[key]):
-                    placed = _placed(text, folder) if key in _FILES and text.endswith(".toml") else text
+                    is_file = key == "mapping" and self.mapping_file
+                    placed = _hyphenless(str(folder / text)) if is_file else text
                     yield from (
                         [named] if text is _FLAG else [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
                     )
@@ -192,9 +201,12 @@ class Project(BaseModel):
             kinds = (("control", "PositionControl"), ("motor", "MotorCurrents"))
             drive = "".join(f", actuation=dr.{kind}({_given(options[k])[2:]})" for k, kind in kinds if k in options)
             return [f"model = dr.models.robot({_quoted(self.model)}{_given(given)}{drive})"]
-        if self.code:
-            name = self.model.partition(".py:")[2] or "model"
-            return [f"from {Path(self.code).stem} import {name}" + ("" if name == "model" else " as model")]
+        code = _code_and_name(self.model)
+        if code is not None:
+            stem, name = code[0].stem, code[1] or "model"
+            if not (_is_name(stem) and _is_name(name)):  # no import can name it
+                return []
+            return [f"from {stem} import {name}" + ("" if name == "model" else " as model")]
         if self.model.endswith(".json"):
             return [f"model = dr.Result.load({_quoted(self.model)}).model"]
         return [f"model = dr.models.builtin({_quoted(self.model)})"]
@@ -237,11 +249,21 @@ def _pair(key: str, name: str, value: Any) -> str:
     return name if (key, value) == ("fix", "nominal") else f"{name}={value}"
 
 
-def _placed(text: str, folder: Path) -> str:
-    """A model or file beside the project as the command finds it, never a word that begins like an option."""
-    file, py, name = text.partition(".py:")
-    is_file = py or Path(text).suffix or "/" in text
-    return _hyphenless(str(folder / file) + py + name if is_file else text)
+def _code_and_name(model: str) -> tuple[Path, str] | None:
+    """The file of code that a model is, as the command line understands it, and its name there, which may be empty."""
+    return None if Path(model).suffix.lower() in (*_DESCRIPTIONS, ".json") else file_and_name(model, "")
+
+
+def _placed(model: str, folder: Path) -> str:
+    """A model beside the project as the command finds it, never a word that begins like an option."""
+    file, name = _code_and_name(model) or (Path(model), "")
+    is_file = file.suffix or "/" in model
+    return _hyphenless(f"{folder / file}{name and ':'}{name}" if is_file else model)
+
+
+def _is_name(text: str) -> bool:
+    """Whether Python takes a text as a name."""
+    return text.isidentifier() and not keyword.iskeyword(text)
 
 
 def _hyphenless(text: str) -> str:
@@ -250,7 +272,8 @@ def _hyphenless(text: str) -> str:
 
 def _given(arguments: Mapping[str, Any]) -> str:
     """Keyword arguments after others."""
-    return "".join(f", {name}={value!r}" for name, value in arguments.items() if value is not None)
+    given = ((name, value) for name, value in arguments.items() if value is not None)
+    return "".join(f", {n}={x!r}" if _is_name(n) else f", **{ {n: x}!r}" for n, x in given)
 
 
 def _quoted(text: str) -> str:

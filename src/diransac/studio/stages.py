@@ -9,7 +9,7 @@ from typing import Any
 
 from diransac.errors import SettingsError
 from diransac.plain_text import printable
-from diransac.studio.project import NAME, Project, printed, quoted
+from diransac.studio.project import Project, printed, quoted
 
 __all__ = ["CALLS_CODE", "RESULTS", "command", "lines"]
 
@@ -72,8 +72,8 @@ def _horizon(given: Mapping[str, Any]) -> list[str]:
 def _named(given: Mapping[str, Any], key: str, form: Callable[[Any], str]) -> list[str]:
     """Numbers by name as an option's value."""
     values = given.get(key) or {}
-    if not isinstance(values, dict) or any("," in name or "=" in name for name in values):
-        raise SettingsError(f"{key} are numbers by name, without commas")
+    if not isinstance(values, dict) or any("," in x or "=" in x or not x.isprintable() for x in values):
+        raise SettingsError(f"{key} are numbers by name, without commas and control characters")
     return [f"{name}={form(value)}" for name, value in values.items()]
 
 
@@ -93,7 +93,8 @@ def _solve(project: Project, _given: Mapping[str, Any], _results: Sequence[str])
     if not project.logs:
         raise SettingsError("there is no log yet; choose one")
     _model(project)
-    return ["identify", "--config", NAME, "-o", _MODEL, "--report", f"{RESULTS}/report.html"]
+    # Not by the file of the project, which may have changed since its model was confirmed.
+    return ["identify", *project.words(), "-o", _MODEL, "--report", f"{RESULTS}/report.html"]
 
 
 def _validate(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:

@@ -143,7 +143,7 @@ export const model = (root, now) => {
       source = null;
       return;
     }
-    if (!source || source.sha256 !== state.code.sha256)
+    if (!source || source.sha256 !== state.code.sha256 || source.name !== state.code.name)
       source = await get("code").catch((error) => say(error.message));
     if (!source) return;
     if (unchanged(code, state.code, source)) return;
