@@ -10,7 +10,7 @@ Astrom 1980 (prediction errors); Dempster, Laird, Rubin 1977 (noise).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,18 +18,20 @@ import numpy as np
 from diransac.arrays import FloatArray
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
 
-__all__ = ["minimised", "settled"]
+__all__ = ["Minimum", "minimised", "settled"]
 
 _PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 0.7, 0.05, 3
 """Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
 are halved."""
 _NO_WORSE = 1e-4
 """Part of the loss by which a step may raise it: contacts that begin a step earlier make it jump."""
+_LATEST = 3
+"""Steps that tell how far an estimate wanders from pass to pass."""
 _SETTLING = 4
 """Passes in which scales settle with parameters that are given."""
 _FASTER, _LEAST_LACKS = 0.75, 1e-4
@@ -38,13 +40,35 @@ _EARLY, _REACH = 3, {"m": 0.05, "rad": 0.2}
 """Passes before a delay is estimated, for which wrong parameters would stand; step of other parameters at most."""
 
 
+@dataclass(frozen=True)
+class Minimum:
+    """Parameters with the likeliest predictions.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    parameters : (n_p,) array
+    last : Pass
+    converged : bool
+    wander : (n,) array
+        Root mean square of the last few Gauss-Newton steps, the delay's last: where contacts begin a step earlier or
+        later, they do not end.
+    """
+
+    predictor: Predictor
+    parameters: FloatArray
+    last: Pass
+    converged: bool
+    wander: FloatArray
+
+
 def minimised(
     predictor: Predictor,
     p: FloatArray,
     *,
     outliers: bool,
-    progress: Callable[[int, Predictor, FloatArray, Pass], None] | None = None,
-) -> tuple[Predictor, FloatArray, Pass, bool]:
+    progress: Callable[[int, Minimum], None] | None = None,
+) -> Minimum:
     """Parameters with the likeliest predictions, with noise and what the model lacks.
 
     Parameters
@@ -55,25 +79,25 @@ def minimised(
     outliers : bool
         Whether the fraction of outliers is estimated.
     progress : callable, optional
-        Called with the number of each pass, the predictor, the parameters and the pass.
+        Called with the number of each pass, and what was found so far.
 
     Returns
     -------
-    Predictor, (n_p,) array, Pass, bool
-        The last is False where passes did not converge.
+    Minimum
     """
     layout, known = predictor.intervals.layout, predictor.intervals.known
-    converged, stuck, now = False, False, predictor.over_logs(p)
+    converged, stuck, now, steps = False, False, predictor.over_logs(p), list[FloatArray]()
     for k in range(_PASSES):
         held = predictor.free_delay and k < _EARLY
-        if progress is not None:
-            progress(k, predictor, p, now)
         none = np.zeros(int(predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
         pull = precision * np.concatenate([layout.prior_mean - p, none])
         following = _with_scales(predictor, now, outliers=outliers)
         noise = following.noise
         step = now.step(precision, pull, _bounds_of_step(predictor, p, held=held))
+        steps.append(step)
+        if progress is not None:
+            progress(k, Minimum(predictor, p, now, False, _wander(steps)))
         steady = np.abs(np.log(noise.sigma / predictor.noise.sigma)[predictor.columns]).max() < _SETTLED
         errors = np.sqrt(np.diag(now.robust_covariance(precision)))
         if steady and not held and (np.abs(step) <= _CONVERGED * errors).all():
@@ -95,7 +119,12 @@ def minimised(
                 break
         stuck = bool(np.array_equal(then, p))
         p, now = then, found
-    return predictor, p, now, converged
+    return Minimum(predictor, p, now, converged, _wander(steps))
+
+
+def _wander(steps: Sequence[FloatArray]) -> FloatArray:
+    """Root mean square ``(n,)`` of the last few steps."""
+    return np.asarray(np.sqrt(np.mean(np.square(steps[-_LATEST:]), axis=0)))
 
 
 def settled(predictor: Predictor, p: FloatArray) -> tuple[Predictor, Pass]:

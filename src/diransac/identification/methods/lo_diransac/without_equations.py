@@ -18,8 +18,8 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.following import Pass, Predictor
-from diransac.identification.methods.lo_diransac.prediction_error import minimised, settled
+from diransac.identification.methods.lo_diransac.following import Predictor
+from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
 
 if TYPE_CHECKING:
@@ -69,27 +69,27 @@ def estimated_by_simulation(
     begin = settings.start_of(dataset.layout)
     begin = np.ones(len(dataset.layout)) if begin is None else begin
     free = settings.input_delay is not False and bool(np.ptp(intervals.recorded, axis=0).any())
-    last = list[tuple[Predictor, FloatArray, Pass]]()
+    so_far = list[Minimum]()
 
-    def progress(k: int, predictor: Predictor, p: FloatArray, now: Pass) -> None:
-        last[:] = [(predictor, p, now)]
-        text = f"pass {k + 1}: negative log-likelihood {now.loss:.6g}"
+    def progress(k: int, found: Minimum) -> None:
+        so_far[:] = [found]
+        text = f"pass {k + 1}: negative log-likelihood {found.last.loss:.6g}"
         report(callback, "prediction errors", min(0.05 + 0.05 * k, 0.85), text)
 
-    predictor, ended = Predictor.of(intervals, outliers=settings.outliers, free_delay=free), "converged"
+    predictor = Predictor.of(intervals, outliers=settings.outliers, free_delay=free)
     try:
-        predictor, p, now, converged = minimised(predictor, begin, outliers=settings.outliers, progress=progress)
-        ended = "converged" if converged else "limit of passes"
+        found = minimised(predictor, begin, outliers=settings.outliers, progress=progress)
+        ended = "converged" if found.converged else "limit of passes"
     except TimeLimitError:
-        if not last:
+        if not so_far:
             raise
-        (predictor, p, now), ended = last[0], TIME_LIMIT
-    if now.lost > 0.5 * 10.0 * float(intervals.known.sum()):
+        found, ended = so_far[0], TIME_LIMIT
+    if found.last.lost > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
             f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
             "start= or --start"
         )
-    return _Found(settings, dataset, predictor, p, now, ended, notes).estimate()
+    return _Found(settings, dataset, found, ended, notes).estimate()
 
 
 @dataclass(frozen=True)
@@ -159,38 +159,34 @@ class _Found:
 
     settings: LoDiransacSettings
     dataset: Dataset
-    predictor: Predictor
-    parameters: FloatArray
-    last: Pass
+    found: Minimum
     ended: str
     notes: tuple[str, ...]
 
     def covariance(self) -> FloatArray:
-        """Covariance ``(n, n)``, the delay's last if it is estimated; larger by the step that is left."""
-        layout, none = self.dataset.layout, np.zeros(int(self.predictor.free_delay))
+        """Covariance ``(n, n)``, the delay's last if it is estimated; larger as the estimate wanders."""
+        layout, none = self.dataset.layout, np.zeros(int(self.found.predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
-        pull = precision * np.concatenate([layout.prior_mean - self.parameters, none])
-        left = self.last.step(precision, pull)
-        return np.asarray(self.last.robust_covariance(precision) + np.diag(np.square(left)))
+        return np.asarray(self.found.last.robust_covariance(precision) + np.diag(np.square(self.found.wander)))
 
     def estimate(self) -> Estimate:
         """The estimate."""
-        dataset, n = self.dataset, len(self.parameters)
+        dataset, n = self.dataset, len(self.found.parameters)
         whole = self.covariance()
         covariance, lost = whole[:n, :n].copy(), self._lost(whole)
         covariance[lost] = covariance[:, lost] = np.inf
         names = dataset.layout.names
-        delay_error = float(np.sqrt(whole[-1, -1])) if self.predictor.free_delay else np.inf
+        delay_error = float(np.sqrt(whole[-1, -1])) if self.found.predictor.free_delay else np.inf
         late = self._delay(delay_error)
         timing = InputTiming.of(np.full(dataset.model.n_u, late * dataset.dt), *np.zeros((2, dataset.model.n_u)))
         return Estimate(
-            parameters=dict(zip(names, self.parameters.tolist(), strict=True)),
+            parameters=dict(zip(names, self.found.parameters.tolist(), strict=True)),
             covariance=covariance,
             degrees_of_freedom=_GAUSSIAN,
             n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
             estimator="prediction errors",
             stop_reason=self.ended,
-            resolution=Resolution("rk4", 1, self.predictor.intervals.hold, timing),
+            resolution=Resolution("rk4", 1, self.found.predictor.intervals.hold, timing),
             notes=self.notes,
             diagnosis=self._diagnosis(tuple(n for n, x in zip(names, lost, strict=True) if x), delay_error),
             checks=tuple(self._checks()),
@@ -198,16 +194,16 @@ class _Found:
 
     def _delay(self, error: float) -> float:
         """Delay of the inputs, samples; 0 where it is negligible, or not significant."""
-        size = abs(self.predictor.delay)
-        late = float(self.predictor.delay)
+        size = abs(self.found.predictor.delay)
+        late = float(self.found.predictor.delay)
         return late if size > max(_LEAST_DELAY, 3.0 * error) or self.settings.input_delay else 0.0
 
     def _lost(self, covariance: FloatArray) -> BoolArray:
         """Parameters ``(n,)`` that the logs do not determine: nothing depends on them, or too little."""
-        n = len(self.parameters)
+        n = len(self.found.parameters)
         nominal = np.abs([x.value or 0.0 for x in self.dataset.layout.bounds])
-        size = np.maximum(np.maximum(np.abs(self.parameters), nominal), _SMALL)
-        told = np.diag(self.last.information)[:n] > 0.0
+        size = np.maximum(np.maximum(np.abs(self.found.parameters), nominal), _SMALL)
+        told = np.diag(self.found.last.information)[:n] > 0.0
         has_prior = np.isfinite(self.dataset.layout.prior_std)
         return np.asarray(~has_prior & ~(told & (np.sqrt(np.diag(covariance)[:n]) < _NOTHING_KNOWN * size)))
 
@@ -222,7 +218,8 @@ class _Found:
 
     def _diagnosis(self, lost: tuple[str, ...], delay_error: float) -> Diagnosis:
         """Noise, outliers and unmodelled accelerations, by name and over the rows of the given logs."""
-        dataset, one, now, noise = self.dataset, self.predictor.intervals, self.last, self.predictor.noise
+        dataset, now, predictor = self.dataset, self.found.last, self.found.predictor
+        one, noise = predictor.intervals, predictor.noise
         model, dt = dataset.model, one.dt
         columns = {name: model.signals.index(name) for name in dataset.signals}
         outliers = one.known & (noise.inlying(now.residuals, one.known) < _OUTLIER)
@@ -244,7 +241,7 @@ class _Found:
             unmodelled_forces={},
             smoothed_time=begins + dt * place.astype(float),
             smoothed_states=dict(zip(model.state, now.states[shown].T.copy(), strict=True)),
-            input_delay=self.predictor.delay * dt,
+            input_delay=predictor.delay * dt,
             input_delay_error=delay_error * dt,
             input_delay_significant=bool(self._delay(delay_error)),
             unidentifiable=lost,
@@ -253,7 +250,7 @@ class _Found:
 
     def _on_given_logs(self, mask: BoolArray) -> BoolArray:
         """A mask over the intervals' rows as one over the rows of the logs."""
-        pairs = zip(self.predictor.intervals.rows_of_logs, self.dataset.segments, strict=True)
+        pairs = zip(self.found.predictor.intervals.rows_of_logs, self.dataset.segments, strict=True)
         return self.dataset.on_given_logs([mask[rows][: len(one)] for rows, one in pairs])
 
 
