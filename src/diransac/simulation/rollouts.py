@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.model.mjcf.model import MujocoModel
 from diransac.simulation.batch import (
     ClosedLoopBatch,
     GaussNewtonBatch,
@@ -111,7 +110,7 @@ def rollouts(
         raise SettingsError(f"integrator {integrator!r} is unknown; choose one of {', '.join(INTEGRATORS)}.")
     if hold not in HOLDS:
         raise SettingsError(f"hold {hold!r} is unknown; choose one of {', '.join(HOLDS)}.")
-    if isinstance(model, MujocoModel):
+    if not model.has_equations:
         return _by_mujoco(model, scored, hold)
     if substeps < 1:
         raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
@@ -121,10 +120,12 @@ def rollouts(
 
 
 @lru_cache(maxsize=32)
-def _by_mujoco(model: MujocoModel, signals: tuple[str, ...], hold: str) -> Simulator:
+def _by_mujoco(model: SimulatedModel, signals: tuple[str, ...], hold: str) -> Simulator:
     """Rollouts by MuJoCo, by value of what defines them."""
+    from diransac.model.mjcf import MujocoModel
     from diransac.simulation.mujoco import MujocoRollouts
 
+    assert isinstance(model, MujocoModel)
     return MujocoRollouts(model, signals, hold)
 
 
