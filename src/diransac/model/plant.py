@@ -216,8 +216,6 @@ class DisturbedModel:
     followed by the constants of the disturbances.  Two are equal if these equations are, for any values of constants.
     """
 
-    has_equations = True
-
     def __init__(self, model: Model, disturbances: Sequence[Disturbance]) -> None:
         self.model, self.disturbances = model, tuple(disturbances)
         self.name = " with ".join((model.name, " and ".join(one.name for one in self.disturbances)))

@@ -110,7 +110,7 @@ def rollouts(
         raise SettingsError(f"integrator {integrator!r} is unknown; choose one of {', '.join(INTEGRATORS)}.")
     if hold not in HOLDS:
         raise SettingsError(f"hold {hold!r} is unknown; choose one of {', '.join(HOLDS)}.")
-    if not model.has_equations:
+    if not getattr(model, "has_equations", True):
         return _by_mujoco(model, scored, hold)
     if substeps < 1:
         raise SettingsError(f"substeps is {substeps}, but a row takes at least 1 integration step.")
