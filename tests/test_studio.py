@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -371,7 +372,8 @@ def test_inspect_takes_known_parameters(folder):
 
 def test_the_server_starts_tells_its_address_and_ends_with_its_jobs_by_ctrl_c(folder):
     words = [sys.executable, "-m", "diransac", "studio", "swim.csv", "--port", "0", "--no-browser"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as server:
+    begin = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which a shell's background jobs ignore
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=begin) as server:
         address = server.stderr.readline().split()[0]
         assert address.startswith("http://127.0.0.1:")
         with urllib.request.urlopen(address) as answer:
