@@ -266,6 +266,16 @@ def test_the_same_seed_gives_the_same_answer(
     assert again.parameters == linkage[1].parameters
 
 
+@pytest.mark.parametrize(
+    "option", [{"horizon": 0.5}, {"with_suggestions": True}, {"method": dr.LoDiransac(substeps=9)}]
+)
+def test_an_option_that_belongs_to_equations_is_refused(
+    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], option: dict[str, Any]
+) -> None:
+    with pytest.raises(dr.SettingsError, match="equations"):
+        dr.identify(linkage[0], four_bar[1], **option)
+
+
 def test_what_no_contact_shows_is_named(hopper_file: Path) -> None:
     names: dict[str, Any] = {f"slide{k}": (lambda d, k=k: d.qpos[7 + k], 2e-4) for k in range(4)}
     log = recorded(hopper(0.5, 0.0, 0.8, 20.0), lambda t: np.full(4, 0.002 * np.sin(9.0 * t)), 1.0, names, 2)

@@ -140,8 +140,10 @@ def identify(
         raise SettingsError(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
-    if with_suggestions and not getattr(chosen, "suggestions", False):
-        raise SettingsError(f"with_suggestions=True needs suggestions, which method {chosen.name} does not give")
+    if with_suggestions and not (getattr(chosen, "suggestions", False) and model.has_equations):
+        raise SettingsError(
+            "with_suggestions=True needs suggestions of a method and a model with equations: lo-diransac's"
+        )
     known = KnownParameters.of(model, fixed, priors)
     task = _Task(known, given, chosen, int(seed), hold, compares=compare_logs and len(given) > 1)
     with time_limited(time_limit), numerical_failures(given):

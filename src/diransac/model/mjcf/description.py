@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["Drives", "JointColumns", "SensorColumns", "compiled_text", "file_drives", "joint_columns", "sensor_columns"]
 
 _FREE, _BALL = 0, 1
-_ALL = 8191
-"""``mjSTATE_FULLPHYSICS`` and all that a model may add to it is compared with positions, velocities and time."""
 
 
 @dataclass(frozen=True)

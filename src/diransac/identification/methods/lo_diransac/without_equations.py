@@ -6,14 +6,14 @@ Nothing here regresses, smooths or differentiates; hypotheses are the nominal va
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data.input_timing import InputTiming
-from diransac.errors import IdentificationError, LogError, TimeLimitError
+from diransac.errors import IdentificationError, LogError, SettingsError, TimeLimitError
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
@@ -34,6 +34,11 @@ _SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
 """Samples of an interval; intervals of the logs at least."""
 _NOTHING_KNOWN, _SMALL = 1.0, 0.01
 """Standard error of a parameter over its size from which on a log tells nothing of it; size at least."""
+_USED = (
+    "criteria", "stuck_rows", "input_window", "input_threshold", "median_window", "smoothing_half_width", "outliers",
+    "input_delay", "start",
+)  # fmt: skip
+"""Settings that are used without equations."""
 _LEAST_DELAY = 0.05
 """Delay, samples, that is none."""
 _OUTLIER, _GAUSSIAN = 0.5, 10_000
@@ -57,6 +62,8 @@ def estimated_by_simulation(
 
     Raises
     ------
+    SettingsError
+        A setting is given that belongs to equations.
     LogError
         The logs are too short.
     IdentificationError
@@ -64,6 +71,7 @@ def estimated_by_simulation(
     TimeLimitError
         The time limit was reached before a pass over the logs had ended.
     """
+    _check_settings(settings)
     report(callback, "following the motion", 0.0)
     intervals, notes = _intervals(settings, dataset)
     begin = settings.start_of(dataset.layout)
@@ -90,6 +98,13 @@ def estimated_by_simulation(
             "start= or --start"
         )
     return _Found(settings, dataset, found, ended, notes).estimate()
+
+
+def _check_settings(settings: LoDiransacSettings) -> None:
+    """Raise SettingsError: a setting is given for which a model without equations has no use."""
+    for field in fields(settings):
+        if field.name not in _USED and getattr(settings, field.name) != field.default:
+            raise SettingsError(f"{field.name} is given, for which a model without equations has no use; leave it out")
 
 
 @dataclass(frozen=True)
