@@ -141,9 +141,8 @@ def identify(
             "bandwidth is given without differentiate=True, which alone uses it (and lo-diransac does not)"
         )
     if with_suggestions and not (getattr(chosen, "suggestions", False) and model.has_equations):
-        raise SettingsError(
-            "with_suggestions=True needs suggestions of a method and a model with equations: lo-diransac's"
-        )
+        without = f"method {chosen.name}" if model.has_equations else "a model without equations"
+        raise SettingsError(f"with_suggestions=True needs suggestions, which {without} does not give")
     known = KnownParameters.of(model, fixed, priors)
     task = _Task(known, given, chosen, int(seed), hold, compares=compare_logs and len(given) > 1)
     with time_limited(time_limit), numerical_failures(given):
