@@ -1,14 +1,14 @@
-"""Ablation of lo-diransac: what each part contributes, on real records, on regimes, and on a corrupted flight.
+"""Ablation of lo-diransac: what each part contributes, on real records, regimes, further machines, and a flight.
 
-``python benchmarks/ablation.py [--parts projection,"delays of inputs"] [--seeds 1000:1001] [--records emps,go2-RL]
-[--out rows.jsonl] [--table FILE]``
+``python benchmarks/ablation.py [--parts projection,"least squares+second fit"] [--seeds 1000:1001]
+[--records emps,go2-RL] [--out rows.jsonl] [--table FILE]``
 
-Every run is repeated without one part at a time: by a setting where there is one, else by a patch of the function that
-does the part's work.  Rows are written as they are measured, and a run that is repeated with the same ``--out`` goes on
-from them.  The table has, for each part, the geometric mean of the ratio of errors without and with it, and the runs
-whose error changes by more than a tenth, better or worse.  Errors are held-out ones of real records (`real`), and those
-of the worst parameter elsewhere: relative to the truth in regimes, to least squares of the noise-free flight in the
-corrupted ones.
+Every run is repeated without one part at a time, or without several that `+` joins: by a setting where there is one,
+else by a patch of the function that does the part's work. Rows are written as they are measured, and a run that is
+repeated with the same ``--out`` goes on from them. The table has, for each part, the geometric mean of the ratio of
+errors without and with it, and the runs whose error changes by more than a tenth, better or worse. Errors are
+held-out ones of real records (`real`), and those of the worst parameter elsewhere: relative to the truth in regimes and
+for the machines of ``../shared/cases`` (`machines`), to least squares of the noise-free flight in the corrupted ones.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,13 @@ class Part:
 
     def left_out(self) -> list[AbstractContextManager[object]]:
         """Contexts in which the part is missing."""
-        return [patch(f"{METHOD}.{name}", value) for name, value in self.patches] or [nullcontext()]
+        return [patch(f"{METHOD}.{name}", value) for name, value in self.patches]
+
+    def __add__(self, other: Part) -> Part:
+        """Both parts left out."""
+        values = ((x.name, getattr(other.settings, x.name)) for x in fields(DEFAULT))
+        changed = {name: value for name, value in values if value != getattr(DEFAULT, name)}
+        return Part(replace(self.settings, **changed), self.patches + other.patches)
 
 
 def _without_source(name: str) -> Part:
@@ -132,10 +138,36 @@ def regime_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
             yield f"{kind}/{name}/{seed}", partial(_error, regime.machine.model, recording.log, recording.truth)
 
 
-def _error(model: dr.Model, log: dr.Log, truth: Mapping[str, float], method: dr.LoDiransac) -> float:
+def _error(model: dr.Model, log: dr.Log | list[dr.Log], truth: Mapping[str, float], method: dr.LoDiransac) -> float:
     """Relative error of the worst parameter."""
     found = dr.identify(model, log, method, differentiate=True).parameters
-    return max(abs(found[name] / x - 1.0) for name, x in truth.items())
+    return max(abs(found.get(name, np.inf) / x - 1.0) for name, x in truth.items())
+
+
+def machine_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
+    """Machines that nothing was developed on by the error of the worst parameter; none where they are missing."""
+    cases = DATA.parent / "cases"
+    if not cases.is_dir():
+        print(f"{cases} is missing: no further machines", file=sys.stderr)
+        return
+    sys.path.insert(0, str(cases))
+    from four_machines_run import MACHINES as FURTHER
+    from four_machines_run import REGIMES as FAULTS
+    from four_machines_run import recorded
+
+    for name, faults in FAULTS.items():
+        machine = FURTHER[name]
+        for label, fault in faults.items():
+            constants = {k: x * fault["wrong"].get(k, 1.0) for k, x in machine.constants.items()}
+            for seed in seeds:
+                logs, truth = [], {}
+                for k in range(len(machine.logs)):
+                    flown, columns = recorded(machine, fault, seed, k)
+                    inputs = dict(zip(machine.inputs, flown.u.T, strict=True))
+                    logs.append(dr.Log.from_arrays(flown.t, {**columns, **inputs}))
+                    truth |= {x: flown.p[x] for x in machine.truth if x not in machine.per_log}
+                run = partial(_error, machine.model(constants), logs, truth)
+                yield f"machines/{name}/{label}/{seed}", run
 
 
 def corrupted_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
@@ -213,16 +245,14 @@ CORRUPTIONS: dict[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], A
 # ---------------------------------------------------------------------- rows and table
 def measured(part: str, name: str, run: Run) -> Row:
     """Error and time of a run without a part; an error of infinity where it is refused."""
-    begin, contexts = time.perf_counter(), PARTS[part].left_out()
-    try:
-        for context in contexts:
-            context.__enter__()
-        error = run(PARTS[part].settings)
-    except dr.DiransacError:
-        error = np.inf
-    finally:
-        for context in contexts:
-            context.__exit__(None, None, None)
+    begin, missing = time.perf_counter(), sum((PARTS[x] for x in part.split("+")), Part())
+    with ExitStack() as stack:
+        for context in missing.left_out():
+            stack.enter_context(context)
+        try:
+            error = run(missing.settings)
+        except dr.DiransacError:
+            error = np.inf
     return {"part": part, "run": name, "error": error, "seconds": time.perf_counter() - begin}
 
 
@@ -254,7 +284,7 @@ def _cell(rows: Sequence[Row], whole: dict[str, Row]) -> str:
 def main() -> None:
     """Measure what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", help="names or beginnings of names; all by default")
+    parser.add_argument("--parts", help="names, joined by + if left out together; each part by default")
     parser.add_argument(
         "--seeds", default="1000:1001", help="of the regimes and the corrupted flights, from A to B - 1"
     )
@@ -267,9 +297,9 @@ def main() -> None:
     done = {(row["part"], row["run"]) for row in rows}
     first, last = map(int, chosen.seeds.split(":"))
     seeds = range(first, last)
-    runs = [*corrupted_runs(seeds), *regime_runs(seeds), *real_runs(chosen.records.split(","))]
-    beginnings = ("nothing", *(chosen.parts.split(",") if chosen.parts else [""]))
-    for part in [x for x in PARTS if x.startswith(beginnings)]:
+    records = chosen.records.split(",")
+    runs = [*corrupted_runs(seeds), *regime_runs(seeds), *machine_runs(seeds), *real_runs(records)]
+    for part in ("nothing", *(chosen.parts.split(",") if chosen.parts else [x for x in PARTS if x != "nothing"])):
         for name, run in runs:
             if (part, name) not in done:
                 rows.append(measured(part, name, run))
