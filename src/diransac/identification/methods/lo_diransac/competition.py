@@ -247,7 +247,7 @@ class Contest:
 
     def _starts(self, first: Searched | None) -> FloatArray:
         """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
-        found, given = [x.parameters for x in self.candidates], _given_start(self.settings, self.dataset)
+        found, given = [x.parameters for x in self.candidates], self.settings.start_of(self.dataset.layout)
         found += [] if given is None else [given]
         if first is not None:
             found += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
@@ -397,21 +397,6 @@ class Contest:
             for one, x, loss, as_good in rows
         )  # fmt: skip
         return Competition(self.candidates[winner].name, self.arbiter.horizons, competitors)
-
-
-def _given_start(settings: LoDiransacSettings, dataset: Dataset) -> FloatArray | None:
-    """The user's start, means of priors and nominal values, in this order; one where there is none of these.
-
-    None where there is none of any parameter.
-    """
-    layout, start = dataset.layout, settings.start or {}
-    found = []
-    for name, bound, mean, std in zip(layout.names, layout.bounds, layout.prior_mean, layout.prior_std, strict=True):
-        plain = name.partition("[")[0]
-        nominal = mean if np.isfinite(std) else bound.value
-        found.append(start.get(plain, nominal))
-    known = [x for x in found if x is not None]
-    return np.array([1.0 if x is None else x for x in found], float) if known else None
 
 
 def _estimates_of_fit(

@@ -8,14 +8,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
@@ -23,6 +23,7 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
+from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LoDiransac", "configured"]
 
-_OUTLIER = 0.5
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 _MANY_ROWS = 200_000
@@ -349,50 +349,21 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
 
 def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
-    dataset, best, result = found.dataset, found.best, found.result
+    best, result = found.best, found.result
     intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
-    model, dt, late = dataset.model, intervals.dt, best.common_timing
-    columns = {name: model.signals.index(name) for name in dataset.signals}
-    seen = intervals.known.any(axis=0)
-    sigma, fraction = (np.where(seen, x, np.nan) for x in (fit.noise.sigma, fit.noise.pi))
-    inlying = fit.noise.inlying(fit.residuals, intervals.known)
-    outliers = intervals.known & (inlying < _OUTLIER)
-    counted = outliers.sum(axis=0) / np.maximum(intervals.known.sum(axis=0), 1)
-    fraction = np.where(fit.noise.has_outliers, fraction, np.where(seen, counted, np.nan))
-    shown = intervals.is_logged[intervals.starts]
-    window_log = intervals.log_of[shown]
-    begins = np.array([one.log.time[one.offset] for one in dataset.segments])[window_log]
-    place = intervals.starts[shown] - intervals.first_of_log[window_log]
     accelerations = [result.unexplained]
     if found.lacks and found.lacks.suggestions:
         accelerations.append(found.lacks.accelerations)
     forces = _forces_of(intervals, fit, result.parameters, accelerations)
-    per_equation: Callable[[FloatArray], dict[str, FloatArray]] = lambda x: dict(  # noqa: E731
-        zip(model.accelerations, x[shown].T.copy(), strict=True)
-    )
-    return Diagnosis(
-        noise_std={name: float(sigma[k]) for name, k in columns.items()},
-        outlier_fraction={name: float(fraction[k]) for name, k in columns.items()},
-        outliers={name: _on_given_logs(dataset, intervals, outliers[:, k]) for name, k in columns.items()},
-        window_log=window_log,
-        unmodelled_time=begins + dt * (place + 0.5 * (intervals.length - 1)),
-        unmodelled_accelerations=per_equation(result.unexplained),
-        unmodelled_forces=per_equation(forces[0]) if forces else {},
-        smoothed_time=begins + dt * place.astype(float),
-        smoothed_states=dict(zip(model.state, fit.x[shown].T.copy(), strict=True)),
-        input_delay=late.size * dt if late else 0.0,
-        input_delay_error=late.std * dt if late else np.inf,
+    fitted, late = (fit.noise, fit.residuals, fit.x), best.common_timing
+    return replace(
+        diagnosis_of(found.dataset, intervals, fitted, result.unexplained, (lost, combinations)),
+        unmodelled_forces=by_acceleration(intervals, forces[0]) if forces else {},
+        input_delay=late.size * intervals.dt if late else 0.0,
+        input_delay_error=late.std * intervals.dt if late else np.inf,
         input_delay_significant=found.is_late,
-        unidentifiable=lost,
-        combinations=combinations,
-        suggested_terms=per_equation((forces or accelerations)[1]) if len(accelerations) > 1 else {},
+        suggested_terms=by_acceleration(intervals, (forces or accelerations)[1]) if len(accelerations) > 1 else {},
     )
-
-
-def _on_given_logs(dataset: Dataset, intervals: ShootingIntervals, mask: BoolArray) -> BoolArray:
-    """A mask over the intervals' rows as one over the rows of the logs."""
-    parts = [mask[rows][: len(one)] for rows, one in zip(intervals.rows_of_logs, dataset.segments, strict=True)]
-    return dataset.on_given_logs(parts)
 
 
 def _forces_of(

@@ -18,6 +18,7 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
+from diransac.identification.methods.lo_diransac.diagnosing import diagnosis_of
 from diransac.identification.methods.lo_diransac.following import Predictor
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
@@ -233,40 +234,15 @@ class _Found:
 
     def _diagnosis(self, lost: tuple[str, ...], delay_error: float) -> Diagnosis:
         """Noise, outliers and unmodelled accelerations, by name and over the rows of the given logs."""
-        dataset, now, predictor = self.dataset, self.found.last, self.found.predictor
-        one, noise = predictor.intervals, predictor.noise
-        model, dt = dataset.model, one.dt
-        columns = {name: model.signals.index(name) for name in dataset.signals}
-        outliers = one.known & (noise.inlying(now.residuals, one.known) < _OUTLIER)
-        shown = one.is_logged[one.starts]
-        window_log = one.log_of[shown]
-        begins = np.array([x.log.time[x.offset] for x in dataset.segments])[window_log]
-        place = one.starts[shown] - one.first_of_log[window_log]
-        unmodelled = now.jumps[shown, model.n_q :] / one.duration
-        has = noise.has_outliers
-        return Diagnosis(
-            noise_std={name: float(noise.sigma[k]) for name, k in columns.items()},
-            outlier_fraction={
-                name: float(noise.pi[k] if has[k] else outliers[:, k].mean()) for name, k in columns.items()
-            },
-            outliers={name: self._on_given_logs(outliers[:, k]) for name, k in columns.items()},
-            window_log=window_log,
-            unmodelled_time=begins + dt * (place + 0.5 * (one.length - 1)),
-            unmodelled_accelerations=dict(zip(model.accelerations, unmodelled.T.copy(), strict=True)),
-            unmodelled_forces={},
-            smoothed_time=begins + dt * place.astype(float),
-            smoothed_states=dict(zip(model.state, now.states[shown].T.copy(), strict=True)),
-            input_delay=predictor.delay * dt,
-            input_delay_error=delay_error * dt,
+        now, predictor = self.found.last, self.found.predictor
+        one, fitted = predictor.intervals, (predictor.noise, now.residuals, now.states)
+        unmodelled = now.jumps[:, one.model.n_q :] / one.duration
+        return replace(
+            diagnosis_of(self.dataset, one, fitted, unmodelled, (lost, tuple(map(_untold, lost)))),
+            input_delay=predictor.delay * one.dt,
+            input_delay_error=delay_error * one.dt,
             input_delay_significant=bool(self._delay(delay_error)),
-            unidentifiable=lost,
-            combinations=tuple(_untold(name) for name in lost),
         )
-
-    def _on_given_logs(self, mask: BoolArray) -> BoolArray:
-        """A mask over the intervals' rows as one over the rows of the logs."""
-        pairs = zip(self.found.predictor.intervals.rows_of_logs, self.dataset.segments, strict=True)
-        return self.dataset.on_given_logs([mask[rows][: len(one)] for rows, one in pairs])
 
 
 def _untold(name: str) -> str:
