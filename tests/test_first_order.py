@@ -5,7 +5,6 @@ Logs are made by LSODA, SciPy's `odeint`, from equations that are written here o
 
 import pickle
 import runpy
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from diransac.errors import TimeLimitError
 from diransac.identification.assessment.inspection import inspect
 from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.observers import Observers
+from diransac.identification.regression.observers import observers
 from diransac.identification.structure.structural import structural
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
@@ -333,7 +332,7 @@ def observers_of_joint(bandwidth):
     layout = ParameterLayout(model.parameters)
     sampled, weights = signals["motor"][:, None], np.full((len(t), 1), 1e4 / len(t))
     given = (inputs["torque"][:, None], np.zeros((len(t), 0)), weights, states[:1], [slice(0, len(t))], t[1])
-    problem = Observers(model, layout, ("motor",), sampled, *given, bandwidth)
+    problem = observers(model, layout, ("motor",), sampled, *given, bandwidth)
     z = np.concatenate([[1.1 * x for x in JOINT.values()], states[0]])[None]
     return problem, z, signals
 
@@ -377,7 +376,8 @@ def test_observers_find_a_joint_from_anywhere():
 
 def test_observers_of_long_logs_have_fewer_starts():
     problem, _, _ = observers_of_joint(8.0)
-    longer = replace(problem, samples=np.zeros((100_000, 1)))
+    given = (problem.inputs, problem.readings, problem.weights, problem.begin, problem.rows_of_logs, problem.dt)
+    longer = observers(problem.model, problem.layout, ("motor",), np.zeros((100_000, 1)), *given, 8.0)
     assert len(problem.starts()) == 256
     assert 16 <= len(longer.starts()) < 64
 

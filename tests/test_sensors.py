@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import diransac as dr
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.identification.assessment.inspection import inspect
-from diransac.identification.regression.observers import DrivenStates
+from diransac.identification.regression.observers import driven_states
 from diransac.identification.structure.lacking_terms import Suggestion, with_terms
 from diransac.model import expressions
 from diransac.simulation import Measurements, RolloutBatch, rollouts
@@ -513,7 +513,7 @@ def test_an_attitude_that_nothing_measures_is_the_one_within_half_a_turn_of_zero
     rows = [slice(0, n), slice(n, 2 * n)]
     layout = ParameterLayout(dict(model.parameters), 2)
     zeros = [np.zeros((2 * n, k)) for k in (len(model.state), 1, 0, 1)]
-    problem = DrivenStates(model, layout, ("tilt", "tilt_dot"), *zeros, rows, 0.01, 10.0, np.array([0.5]))
+    problem = driven_states(model, layout, ("tilt", "tilt_dot"), *zeros, rows, 0.01, 10.0, np.array([0.5]))
     found = problem.trajectories(begin)["tilt"]
     assert_allclose(found[[0, n]], [0.2 + 2.0 * np.pi * (1 - turns), -0.2 - 4.0 * np.pi * (1 - turns)])
     if turns:

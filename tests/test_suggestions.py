@@ -165,7 +165,7 @@ def test_what_actuators_make_of_inputs_has_bounds_within_which_it_grows_with_the
     model = crane()
     candidates = candidate_terms(model, np.ones(model.n_v), np.full((model.n_u, 2), [0.8, 1.6]))
     u = np.linspace(-1.6, 1.6, 200)
-    for term in (x for x in candidates.terms if x.is_of_input):
+    for term in (x for x in candidates.terms if x.equation < 0):
         low, high = term.bounds
         effect = ca.Function("effect", list(candidates.symbols), [term.residuals])
         motion = [np.ones((x.numel(), len(u))) for x in candidates.symbols]
@@ -229,9 +229,9 @@ def test_printed_code_is_the_term_that_with_terms_adds(model):
         after = np.array(extended.residual(*motion[:4], np.vstack([motion[4], np.full(7, 0.7)])))
         named = dict(zip("qvau", model.named(q, v, a, u), strict=True))
         coefficient = type("Parameters", (), {one.parameter: ca.SX(0.7)})
-        written = eval(one.code if term.is_of_input else f"0 {one.code}", {"ca": ca, "p": coefficient, **named})
+        written = eval(one.code if term.equation < 0 else f"0 {one.code}", {"ca": ca, "p": coefficient, **named})
         values = np.array(ca.Function("written", [q, v, a, u, p], [written])(*motion))
-        if term.is_of_input:
+        if term.equation < 0:
             changed = motion[3].copy()
             changed[list(model.inputs).index(term.place)] = values
             np.testing.assert_allclose(after, np.array(model.residual(*motion[:3], changed, motion[4])), rtol=1e-9)

@@ -9,8 +9,8 @@ import pytest
 import diransac as dr
 from diransac.errors import SettingsError
 from diransac.identification.tracking import Change, TrackedEstimate
-from diransac.identification.tracking import history as histories
-from diransac.identification.tracking.history import History, change_text
+from diransac.identification.tracking import estimates as histories
+from diransac.identification.tracking.estimates import History, change_text
 from diransac.plots.tracking import plot_tracking
 from diransac.report.tracking import write_tracking_report
 
@@ -40,7 +40,7 @@ def test_a_long_history_keeps_its_ends_its_changes_and_a_bounded_number(monkeypa
     assert history.time[0] == 1.0
     assert history.last.time == 1000.5
     assert np.ptp(np.diff(history.time)) == 0.0
-    assert len(history.notes) == histories._MOST_NOTES
+    assert len(history.notes) == 500
 
 
 def test_a_change_is_a_sentence():

@@ -18,7 +18,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing import unit_factors
 from diransac.errors import ResultError
-from diransac.identification.tracking.history import History, change_text
+from diransac.identification.tracking.estimates import History, change_text
 from diransac.plain_text import one_line
 from diransac.text_table import aligned, number, percent, plural
 

@@ -195,13 +195,6 @@ _LENGTH = 8
 _FEWEST = 5 * _LENGTH
 
 
-_FAR, _OWN = 6.0, 3.0
-"""RMS of a stretch, and size within it, over the scale of the log.
-
-Of one log of each regime of the robustness benchmark, those of saturated and of wrong inputs alone exceed it.
-"""
-
-
 @dataclass(frozen=True)
 class Departure:
     """A stretch in which the model does not hold.
@@ -242,9 +235,10 @@ def departures(diagnosis: Diagnosis, log: int, unexplained: Mapping[str, float])
             continue
         scale = _scale(values)
         modelled = float(np.sqrt(np.mean(np.square(values)))) * (1.0 - share) / share
-        # A stretch must be material beside the accelerations by the model, too.
-        far = (ratio > _FAR) & (ratio * scale > 0.3 * modelled)
-        departing |= far & (np.abs(values) > _OWN * scale)
+        # Of the regimes of the robustness benchmark, saturated and wrong inputs alone exceed these multiples of the
+        # scale.  A stretch must be material beside the accelerations by the model, too.
+        far = (ratio > 6.0) & (ratio * scale > 0.3 * modelled)
+        departing |= far & (np.abs(values) > 3.0 * scale)
         ratios = np.maximum(ratios, np.where(far, ratio, 0.0))
     width = float(np.median(np.diff(time)))
     return [

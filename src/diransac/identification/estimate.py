@@ -10,12 +10,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.finding import Finding
-from diransac.identification.serialization import (
-    Mask,
-    Number,
-    Numbers,
-    Values,
-)
+from diransac.identification.serialization import Mask, Number, Numbers, Values
 from diransac.identification.structure.lacking_terms import PossibleTerm, Suggestion
 
 __all__ = [

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from diransac.data.dataset import Dataset
+from diransac.data.log import Log
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import motion_rows
+from diransac.identification.settings import Settings
 from diransac.identification.structure.refusal import cause_of_refusal
 from diransac.identification.structure.structural import structural
+from diransac.model import Model
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.data.log import Log
     from diransac.identification.estimate import Estimate
-    from diransac.identification.settings import Settings
-    from diransac.model import Model
 
 __all__ = ["Callback", "Method", "Progress", "extremes", "fit", "numerical_failures", "report", "within"]
 

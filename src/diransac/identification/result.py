@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from diransac.identification.regression.uncertainty import student_quantile, stu
 from diransac.identification.result_text import html_of, text_of
 from diransac.identification.settings import Settings
 from diransac.identification.structure.lacking_terms import (
+    PossibleTerm,
     StructuralUncertainty,
     Suggestion,
     largest,
@@ -32,9 +33,6 @@ from diransac.identification.structure.lacking_terms import (
 from diransac.model import Model
 from diransac.model.parameter import parameter_of
 from diransac.plain_data import json_data, read_text
-
-if TYPE_CHECKING:
-    from diransac.identification.structure.lacking_terms import PossibleTerm
 
 __all__ = ["Result"]
 

@@ -24,12 +24,8 @@ __all__ = [
     "nearest_names",
 ]
 
-# Similarity of names, 0 to 1, from which on one is taken for a misspelling of the other.
 MOST_SUBSTEPS = 10_000
 """Integration steps per sample, at most: more are a slip of the pen, and take hours."""
-
-REFITS = ("inliers", "none")
-INITIAL_STATES = ("first", "robust")
 
 JUDGING = ("inlier_thresholds", "min_inlier_signals", "error_weights")
 """Settings of the fit error and the inliers, which every method's evaluation has."""
@@ -118,12 +114,12 @@ class Settings:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _by_name(name, getattr(self, name), 0.0))
         self._check_acceptance()
-        _one_of("refit", self.refit, REFITS)
+        _one_of("refit", self.refit, ("inliers", "none"))
         _one_of("integrator", self.integrator, tuple(INTEGRATORS))
         if isinstance(self.initial_state, Mapping):
             object.__setattr__(self, "initial_state", _by_name("initial_state", self.initial_state, -np.inf))
         else:
-            _one_of("initial_state", self.initial_state, INITIAL_STATES)
+            _one_of("initial_state", self.initial_state, ("first", "robust"))
 
     def _check_acceptance(self) -> None:
         try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.tracking.history import History
+from diransac.identification.tracking.estimates import History
 from diransac.plots.figure import (
     COLOURS,
     DASHES,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.tracking.history import History
+from diransac.identification.tracking.estimates import History
 from diransac.report import provenance
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.rendering import Table, write_page

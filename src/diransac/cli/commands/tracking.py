@@ -32,7 +32,7 @@ from diransac.errors import LogError
 from diransac.identification.result import Result
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking import TrackedEstimate, Tracker, refused_if_none, track
-from diransac.identification.tracking.history import History
+from diransac.identification.tracking.estimates import History
 from diransac.model import Model
 
 if TYPE_CHECKING:

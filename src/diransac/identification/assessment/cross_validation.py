@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from diransac.identification.identify import identify
 from diransac.identification.method import Callback, Method, within
 from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
+from diransac.model import Model
 from diransac.text_table import aligned
 from diransac.time_limit import check_time, time_limited
-
-if TYPE_CHECKING:
-    from diransac.model import Model
 
 __all__ = ["CrossValidation", "cross_validate"]
 

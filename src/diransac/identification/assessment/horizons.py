@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,21 +12,16 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment, runs
 from diransac.errors import LogError
+from diransac.identification.assessment.window_starts import SmoothedLog, WindowStarts
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.observers import DrivenStates
-
-if TYPE_CHECKING:
-    from diransac.identification.assessment.window_starts import SmoothedLog, WindowStarts
-    from diransac.model import Model
+from diransac.identification.regression.observers import driven_states
+from diransac.model import Model
 
 __all__ = ["HorizonScores", "OpenLoop", "StartRule", "derived_velocities", "pooled_scores"]
 
 StartRule = Literal["smoothed", "measured"]
-
-_N_PROBES = 4
-"""Random signs of the changes whose effect on a prediction is its sensitivity."""
 
 
 @dataclass(frozen=True)
@@ -291,7 +286,7 @@ class OpenLoop:
         self, errors: FloatArray, states: FloatArray, deviations: FloatArray, rows: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Root mean square effects ``(K, steps, n_s)`` of uncertain starts, and of changed parameters."""
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_PROBES, states.shape[1] + len(self.parameters)))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (4, states.shape[1] + len(self.parameters)))
         of_starts, of_parameters = np.zeros(errors.shape), np.zeros(errors.shape)
         for sign in signs:
             shifted = states + np.einsum("j,kji->ki", sign[: states.shape[1]], deviations)
@@ -300,7 +295,7 @@ class OpenLoop:
                 if deviations.any():
                     of_starts += np.square(self._errors(self.parameters, shifted, rows, errors.shape[1]) - errors)
                 of_parameters += np.square(self._errors(changed, states, rows, errors.shape[1]) - errors)
-        return np.sqrt(of_starts / _N_PROBES), np.sqrt(of_parameters / _N_PROBES)
+        return np.sqrt(of_starts / len(signs)), np.sqrt(of_parameters / len(signs))
 
 
 def _squares(errors: FloatArray, counted: BoolArray) -> FloatArray:
@@ -444,7 +439,7 @@ def _unmeasured(
     # The observers forget within a twentieth of the log.
     bandwidth = 1.0 / (0.05 * len(segment) * segment.log.dt)
     whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
-    problem = DrivenStates(
+    problem = driven_states(
         model, alone, hidden, known, segment.inputs, readings, weights, whole, segment.log.dt, bandwidth, parameters
     )
     found = problem.trajectories(least_squares(problem, problem.starts(), 20)[0][0])

@@ -15,14 +15,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from diransac.identification.assessment.horizons import OpenLoop
+from diransac.identification.assessment.horizons import OpenLoop
 
 __all__ = ["Innovations", "innovations"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, usable_sensors
+from diransac.data.log import Log
 from diransac.data.segment import spelling_notes
 from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.identification.evaluation.scoring import choose_scoring
@@ -24,11 +25,8 @@ from diransac.identification.structure.identifiability import Ambiguity, in_word
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
 from diransac.identification.structure.structural import structural
+from diransac.model import Model
 from diransac.text_table import aligned, percent
-
-if TYPE_CHECKING:
-    from diransac.data.log import Log
-    from diransac.model import Model
 
 __all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
 

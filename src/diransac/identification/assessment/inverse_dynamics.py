@@ -9,22 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
+from diransac.data.dataset import Dataset
 from diransac.errors import LogError
+from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.identification.diagnosis import Resolution
-    from diransac.model import Model
+from diransac.model import Model
 
 __all__ = ["PredictedForces", "force_errors", "predicted_forces"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -81,9 +81,9 @@ def simulate(
     observations = _with_velocities(dataset)
     parameters = plant.parameters_in(given) if isinstance(plant, Result) else known.parameters
     resolution = resolution_of(plant, integrator, substeps, input_hold)
-    bound = _Bound(Simulation(dataset, resolution=resolution), known.model.parameter_vector(parameters), observations)
-    restarts = _starts(plant, given, bound, horizon)
-    series = simulated_rows(bound.simulation, 0, bound.parameters, observations, restarts)
+    simulation, values = Simulation(dataset, resolution=resolution), known.model.parameter_vector(parameters)
+    restarts = _starts(_diagnosis_of(plant, given), simulation, values, observations, horizon)
+    series = simulated_rows(simulation, 0, values, observations, restarts)
     _check_finite(series, observations, restarts)
     return _as_log(known.model, recorded, observations, series, [*dataset.notes, _note(restarts, horizon, resolution)])
 
@@ -97,15 +97,6 @@ def resolution_of(
     own_integrator = fitted.integrator if integrator is None else integrator
     own_substeps = fitted.substeps if substeps is None else substeps
     return Resolution(own_integrator, own_substeps, own_hold, fitted.timing)
-
-
-@dataclass(frozen=True)
-class _Bound:
-    """Simulation of one log, its parameters ``(n_p,)``, and the log's arrays."""
-
-    simulation: Simulation
-    parameters: FloatArray
-    observations: Segment
 
 
 # ---------------------------------------------------------------------- starts
@@ -133,9 +124,14 @@ def _first(log: Log, name: str) -> float:
     return float(next((x for x in samples if np.isfinite(x)), np.nan))
 
 
-def _starts(plant: ModelWithParameters, log: Log, simulation: _Bound, horizon: float | None) -> Restarts:
-    """Rows from which the simulation starts, and its states there."""
-    observations = simulation.observations
+def _starts(
+    diagnosis: Diagnosis | None,
+    simulation: Simulation,
+    parameters: FloatArray,
+    observations: Segment,
+    horizon: float | None,
+) -> Restarts:
+    """Rows from which the simulation starts, and its states there; the diagnosis is of this log."""
     if horizon is None:
         rows = np.array([part.start for part in observations.stretches])
         return _measured_starts(observations, rows, len(observations))
@@ -143,9 +139,8 @@ def _starts(plant: ModelWithParameters, log: Log, simulation: _Bound, horizon: f
     if not finite_number("horizon", horizon) > 0.5 * dt:
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds, at least one sample, {dt:g} s")
     n_rows = round(horizon / dt)
-    diagnosis = _diagnosis_of(plant, log)
     if diagnosis is not None and set(observations.model.state) <= set(diagnosis.smoothed_states):
-        return _smoothed_starts(simulation, diagnosis, n_rows)
+        return _smoothed_starts(diagnosis, simulation, parameters, observations, n_rows)
     rows = restart_rows(observations, n_rows, np.flatnonzero(observations.valid))
     return _measured_starts(observations, rows, n_rows)
 
@@ -158,19 +153,20 @@ def _diagnosis_of(plant: ModelWithParameters, log: Log) -> Diagnosis | None:
     return None if index is None else plant.diagnosis.of_log(index, plant.log_rows(index))
 
 
-def _smoothed_starts(bound: _Bound, diagnosis: Diagnosis, n_rows: int) -> Restarts:
+def _smoothed_starts(
+    diagnosis: Diagnosis, simulation: Simulation, parameters: FloatArray, observations: Segment, n_rows: int
+) -> Restarts:
     """Smoothed states of a log every ``n_rows`` rows, and after gaps.
 
     Between two smoothed states the simulation from the first is interpolated to the second: its difference there is
     added in proportion to time.
     """
-    observations = bound.observations
     begin, dt = observations.log.time[observations.offset], observations.log.dt
     at = np.round((diagnosis.smoothed_time - begin) / dt).astype(int)
     smoothed = np.column_stack([diagnosis.smoothed_states[n] for n in observations.model.state])
     rows = restart_rows(observations, n_rows, at)
     widths, passed = np.diff(at, append=len(observations)), np.cumsum(observations.gaps)
-    found = bound.simulation.trajectories(0, bound.parameters, smoothed, at, int(widths.max()) + 1)
+    found = simulation.trajectories(0, parameters, smoothed, at, int(widths.max()) + 1)
     found = found[:, :, : smoothed.shape[1]]
     tied = np.append(passed[at[1:]] == passed[at[:-1]], False)
     differences = np.zeros_like(smoothed)

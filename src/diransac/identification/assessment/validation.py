@@ -30,8 +30,6 @@ from diransac.text_table import aligned, listed, number, percent
 
 __all__ = ["Validation", "validate"]
 
-_PARTS, _FEWEST_STEPS = (200.0, 50.0, 10.0), 5
-"""Horizons are these parts of a log; samples of one at least."""
 _GOOD = 0.1
 """Relative error of predictions of held-out logs up to which a model is good."""
 _TELLING = 0.1
@@ -334,9 +332,9 @@ def _horizons(given: float | None, predictions: list[OpenLoop], logs: Sequence[L
     if given is not None and not given > 0.5 * dt:
         raise SettingsError(f"horizon is {given} s; give at least one sample, {dt:g} s")
     span = max(one.duration for one in predictions)
-    parts = {_nice(span / part) for part in _PARTS}
-    longest = max(_nice(span / part) for part in _PARTS[1:])
-    wanted = sorted(x for x in parts if x > (_FEWEST_STEPS - 0.5) * dt or x == longest) if given is None else [given]
+    parts = {_nice(span / part) for part in (200.0, 50.0, 10.0)}
+    # Horizons are of five samples at least, but for the longest.
+    wanted = sorted(x for x in parts if x > 4.5 * dt or x == max(parts)) if given is None else [given]
     return [*(h for h in wanted if any(one.steps(h) for one in predictions)), np.inf]
 
 

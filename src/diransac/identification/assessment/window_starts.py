@@ -15,12 +15,14 @@ identification", section 16.4 (initial states of a validation).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.dataset import Dataset
 from diransac.errors import LogError
+from diransac.identification.diagnosis import Resolution
+from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
@@ -28,15 +30,8 @@ from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_st
 from diransac.identification.methods.lo_diransac.without_equations import followed
 from diransac.identification.regression.uncertainty import robust_std
 
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.identification.diagnosis import Resolution
-    from diransac.identification.evaluation.simulation import Simulation
-
 __all__ = ["SmoothedLog", "WindowStarts", "followed_log", "smoothed_log", "window_starts"]
 
-_STEPS = 20
-"""Gauss-Newton steps."""
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
 _SOFT = 3.0
@@ -229,7 +224,8 @@ class _Fit:
     def solved(self, states: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States ``(K, n_x)``, their covariances ``(K, n_x, n_x)``, and the residuals' scale ``(n_s,)``."""
         errors, part = self._errors(states[:, None])[:, 0], np.ones(len(states))
-        for step in range(_STEPS + 1):
+        n_steps = 20
+        for step in range(n_steps + 1):
             scale = np.maximum(least, self._scale(errors))
             jacobian = self._jacobian(states, errors)
             weights = self._weights(errors, scale)
@@ -239,7 +235,7 @@ class _Fit:
             )
             d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300**0.5
             scaled = G / d[:, :, None] / d[:, None, :] + 1e-12 * np.eye(G.shape[1])
-            if step == _STEPS:
+            if step == n_steps:
                 break
             moved = states - part[:, None] * np.linalg.solve(scaled, (g / d)[:, :, None])[:, :, 0] / d
             tried = self._errors(moved[:, None])[:, 0]

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from diransac.data.dataset import Dataset
 from diransac.errors import DiransacError, TimeLimitError
-from diransac.identification.estimate import LogEstimate
-from diransac.identification.method import fit, within
+from diransac.identification.estimate import Estimate, LogEstimate
+from diransac.identification.method import Callback, Method, fit, within
 from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from diransac.data.dataset import Dataset
-    from diransac.identification.estimate import Estimate
-    from diransac.identification.method import Callback, Method
 
 __all__ = ["disagreements"]
 
 
-_DELAY, _SMALL_DELAY = "input delay [s]", 0.25
-"""Name of the delay of the inputs in a sentence, and the difference that is none, samples."""
+_DELAY = "input delay [s]"
+"""Name of the delay of the inputs in a sentence."""
 
 
 def disagreements(
@@ -107,12 +101,8 @@ def _worst(
         if not np.isfinite(variance) or not others:
             continue
         mean, spread, ratio = _combined(others)
-        # A difference of 0.1 % is none, however narrow the intervals are.
-        allowed = max(
-            t * np.sqrt(ratio * (variance + spread)),
-            1e-3 * abs(mean),
-            _SMALL_DELAY * dt if name == _DELAY else 0.0,
-        )
+        # A difference of 0.1 %, or of a quarter of a sample, is none, however narrow the intervals are.
+        allowed = max(t * np.sqrt(ratio * (variance + spread)), 1e-3 * abs(mean), 0.25 * dt if name == _DELAY else 0.0)
         surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
         if surprise > worst:
             worst = float(surprise)

@@ -26,14 +26,10 @@ __all__ = ["bounds_text", "findings_of"]
 
 _NEAR = 0.05
 """Median error of a simulation, over the range of the signal, up to which it is good."""
-_MOST, _HALF, _FEW = 0.7, 0.5, 0.01
-_WIDENED, _AMBIGUOUS = 2.0, 0.1
-"""Widening of an interval by terms that a model may lack, and half of its width over the parameter, that need care."""
+_HALF = 0.5
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
-_STEADY, _UNSTEADY = 0.05, 0.2
-"""Relative changes of a parameter with the filter's bandwidth that are good, and that need care."""
 
 
 def findings_of(result: Result) -> tuple[Finding, ...]:
@@ -195,11 +191,7 @@ def _simulation(result: Result) -> Iterator[Finding]:
         one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
         yield _median_error(result, found, _worst_of(one, logs))
     if any(one.prediction is None for one in logs):
-        yield Finding(
-            "care",
-            "No simulation is compared with the log, because its initial state is missing",
-            VALIDATE,
-        )
+        yield Finding("care", "No simulation is compared with the log, because its initial state is missing", VALIDATE)
 
 
 def _median_error(result: Result, found: Prediction, where: str) -> Finding:
@@ -248,7 +240,7 @@ def _inliers(result: Result) -> Iterator[Finding]:
         claim = f"{text} the simulation, which is less than half of the log"
         yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
-    if fraction >= _MOST:
+    if fraction >= 0.7:
         yield Finding("good", f"{text} the simulation.")
     else:
         yield Finding("care", f"{text} the simulation", "identify with --method lo-diransac")
@@ -271,7 +263,7 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         return
     name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
     most = found.outlier_fraction[name]
-    if most > _FEW:
+    if most > 0.01:
         text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
         # Beyond two thirds the estimate of lo-diransac is arbitrary.
         if most <= 2.0 / 3.0:
@@ -360,7 +352,8 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
             widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
     for possible, names in zero.items():
         if names:
-            claim = f"{', '.join(names)} {_differ(names)} significantly from zero: 0 is in the 95 % interval"
+            verb = "does" if len(names) == 1 else "do"
+            claim = f"{', '.join(names)} {verb} not differ significantly from zero: 0 is in the 95 % interval"
             yield Finding("note", f"{claim}.") if possible else Finding("care", claim, _more_of(result, names))
     wide = sorted((n for n, x in widths.items() if x > 0.5), key=lambda n: -widths[n])
     if wide:
@@ -370,10 +363,6 @@ def _uncertainty(result: Result) -> Iterator[Finding]:
         name = max(widths, key=lambda n: widths[n])
         what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
         yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
-
-
-def _differ(names: Sequence[str]) -> str:
-    return "does not differ" if len(names) == 1 else "do not differ"
 
 
 def _more_of(result: Result, names: Sequence[str]) -> str:
@@ -391,7 +380,7 @@ def _structure(result: Result) -> Iterator[Finding]:
     intervals, widths = result.structural_intervals(), dict[str, float]()
     for name, found in result.structure.items():
         half, value = 0.5 * (intervals[name][1] - intervals[name][0]), abs(result.parameters[name])
-        if found.widening > _WIDENED and half > _AMBIGUOUS * value and name not in result.unidentifiable:
+        if found.widening > 2.0 and half > 0.1 * value and name not in result.unidentifiable:
             widths[name] = half / value if value > 0.0 else np.inf
     for name in sorted(widths, key=lambda n: -widths[n])[:_LISTED]:
         found, (low, high) = result.structure[name], (number(x, 3) for x in intervals[name])
@@ -413,12 +402,13 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
         return
     name = max(changes, key=lambda n: max(map(abs, changes[n])))
     change = max(map(abs, changes[name]))
-    if change > _STEADY:
+    level = graded(change, 0.05, 0.2)
+    if level == "good":
+        text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
+        yield Finding("good", text)
+    else:
         claim = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
-        yield Finding(graded(change, _STEADY, _UNSTEADY), claim, _OTHER_BANDWIDTH)
-        return
-    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
-    yield Finding("good", text)
+        yield Finding(level, claim, _OTHER_BANDWIDTH)
 
 
 # ---------------------------------------------------------------------- search and logs
@@ -442,15 +432,10 @@ def _logs(result: Result) -> Iterator[Finding]:
         if one.remark:
             advice = "leave this log out, or give what differs a value per log"
             yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs", advice)
-    yield from _excluded(result.logs)
+    n_excluded = sum(found.n_excluded for _, found in _predicted(result.logs))
+    if n_excluded:
+        total = plural(sum(one.n_rows for one in result.logs), "row")
+        yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")
     which = "the logs" if len(result.logs) > 1 else "the log"
     text = f"Evaluated on {which} of the identification; held-out data are a stricter test."
     yield Finding("note", text)
-
-
-def _excluded(logs: Sequence[LogSummary]) -> Iterator[Finding]:
-    """Rows in which a required signal is missing."""
-    n_excluded = sum(found.n_excluded for _, found in _predicted(logs))
-    if n_excluded:
-        total = plural(sum(one.n_rows for one in logs), "row")
-        yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")

@@ -5,24 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data.segment import runs
+from diransac.data.dataset import Dataset
+from diransac.data.segment import Segment, runs
 from diransac.errors import LogError
-from diransac.identification.estimate import Prediction
-from diransac.identification.evaluation.scoring import as_estimated
+from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import Estimate, Evaluation, Prediction
+from diransac.identification.evaluation.scoring import Scoring, as_estimated
 from diransac.identification.evaluation.simulation import Simulation
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.data.segment import Segment
-    from diransac.identification.diagnosis import Diagnosis
-    from diransac.identification.estimate import Estimate, Evaluation
-    from diransac.identification.evaluation.scoring import Scoring
-    from diransac.identification.settings import Settings
+from diransac.identification.settings import Settings
 
 __all__ = [
     "Restarts",

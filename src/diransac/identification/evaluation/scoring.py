@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.data.segment import runs
+from diransac.data.dataset import Dataset
+from diransac.data.log import Log
+from diransac.data.segment import Segment, runs
 from diransac.errors import LogError, SettingsError
-from diransac.identification.estimate import Evaluation
+from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import Estimate, Evaluation
 from diransac.identification.evaluation.simulation import Simulation, Stretch, stretches_of
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.data.log import Log
-    from diransac.data.segment import Segment
-    from diransac.identification.diagnosis import Diagnosis
-    from diransac.identification.estimate import Estimate
-    from diransac.identification.settings import Settings
-    from diransac.model import Model
+from diransac.identification.settings import Settings
+from diransac.model import Model
 
 __all__ = ["Scoring", "as_estimated", "choose_scoring", "evaluate", "judged_signals", "mean_squared_error", "rms_error"]
 

@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.dataset import Dataset
+from diransac.data.segment import Segment
 from diransac.identification.diagnosis import Resolution
-from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, default_threads, rollouts
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset
-    from diransac.data.segment import Segment
-    from diransac.simulation import Simulator
+from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, Simulator, default_threads, rollouts
 
 __all__ = ["LogScores", "Scores", "Simulation", "Stretch", "stretches_of"]
 
@@ -113,9 +109,6 @@ def stretches_of(one: Segment, rule: str | Mapping[str, float]) -> tuple[Stretch
     return (Stretch(first, rule), *(Stretch(rows, later) for rows in others))
 
 
-_DEFAULT_RESOLUTION = Resolution()
-
-
 @dataclass(frozen=True)
 class _Run:
     """Data of the simulation of a stretch: all but its parameters.
@@ -167,21 +160,18 @@ class Simulation:
         self,
         dataset: Dataset,
         signals: BoolArray | None = None,
-        resolution: Resolution = _DEFAULT_RESOLUTION,
+        resolution: Resolution | None = None,
         stretches: Sequence[tuple[Stretch, ...]] | None = None,
         threads: int | None = None,
     ) -> None:
         compared = np.ones(len(dataset.signals), bool) if signals is None else signals
+        resolution = resolution or Resolution()
         names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
         self._segments, self._layout = dataset.segments, dataset.layout
         self._stretches = [stretches_of(one, "first") for one in dataset.segments] if stretches is None else stretches
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
-            dataset.model,
-            names,
-            integrator=resolution.integrator,
-            substeps=resolution.substeps,
-            hold=resolution.hold,
+            dataset.model, names, integrator=resolution.integrator, substeps=resolution.substeps, hold=resolution.hold
         )
         self._measured = [
             Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments
@@ -284,11 +274,7 @@ class Simulation:
 
 
 def _incomplete_scores(
-    simulator: Simulator,
-    lanes: RolloutBatch,
-    measured: Measurements,
-    thresholds: FloatArray,
-    min_inlier_signals: int,
+    simulator: Simulator, lanes: RolloutBatch, measured: Measurements, thresholds: FloatArray, min_inlier_signals: int
 ) -> ScoreBatch:
     """Scores of a log with slow signals, or sensors, each of which is compared where it has samples.
 

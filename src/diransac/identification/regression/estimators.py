@@ -14,39 +14,42 @@ With known sigma this is the exact posterior mean of the linear-Gaussian model (
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, null_space, regression
 from diransac.identification.regression.uncertainty import score_inflation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from diransac.data.dataset import Dataset, ParameterLayout
 
 __all__ = ["BoundEstimator", "Estimator", "OrdinaryLeastSquares", "Selection", "TotalLeastSquares"]
 
 
 MIN_EIGENVALUE = 1e-6
-# Noise of a fit with priors at least, over the RMS of b; ridge that makes the sums of a set of rows definite.
-_LEAST_NOISE, _RIDGE = 1e-5, 1e-10
+# Noise of a fit with priors at least, over the RMS of b.
+_LEAST_NOISE = 1e-5
 
 
-class Selection(Protocol):
-    """Sets of rows, gathered once, to be tested and fitted."""
+@dataclass(frozen=True)
+class Selection:
+    """Sets of rows, gathered once, to be tested and fitted.
 
-    def well_defined(self) -> BoolArray:
-        """Mask of the sets that determine the parameters, by the smallest eigenvalue of the column-scaled ``W^T W``."""
+    Parameters
+    ----------
+    well_defined : () -> (n_sets,) bool array
+        Mask of the sets that determine the parameters, by the smallest eigenvalue of the column-scaled ``W^T W``.
+    fit : () -> (n_sets, n) array
+        Parameters; not finite where a set determines none.
+    """
 
-    def fit(self) -> FloatArray:
-        """Parameters ``(n_sets, n)``; not finite where a set determines none."""
+    well_defined: Callable[[], BoolArray]
+    fit: Callable[[], FloatArray]
 
 
 class BoundEstimator(Protocol):
@@ -119,7 +122,7 @@ class _SumsEstimator:
         IdentificationError
             Shapes do not match, or a value is not finite.
         """
-        bound = self._bind(*_flat(W, b))
+        bound = BoundSums(self, *_flat(W, b))
         return np.asarray(bound.select([np.arange(bound.n_rows)]).fit()[0])
 
     def well_defined(self, W: npt.ArrayLike, b: npt.ArrayLike) -> bool:
@@ -139,15 +142,12 @@ class _SumsEstimator:
         IdentificationError
             Shapes do not match, or a value is not finite.
         """
-        bound = self._bind(*_flat(W, b))
+        bound = BoundSums(self, *_flat(W, b))
         return bool(bound.select([np.arange(bound.n_rows)]).well_defined()[0])
 
     def bind(self, dataset: Dataset) -> BoundEstimator:
         """The estimator over the usable rows of a dataset."""
-        return self._bind(*regression(dataset), dataset.layout)
-
-    def _bind(self, W: FloatArray, b: FloatArray, layout: ParameterLayout | None = None) -> BoundSums:
-        return BoundSums(self, W, b, layout)
+        return BoundSums(self, *regression(dataset), dataset.layout)
 
     def solve(self, gram: FloatArray, prior: _PriorSums | None = None) -> FloatArray:
         """Parameters ``(..., n_p)`` from sums ``(..., n_p + 1, n_p + 1)`` with columns of unit RMS, and of priors."""
@@ -230,7 +230,10 @@ def _solved(A: FloatArray, g: FloatArray, prior: _PriorSums | None) -> FloatArra
 
 
 class BoundSums:
-    """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row."""
+    """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row.
+
+    The RMS of each column, 1 of one that is zero, is its ``scale``.
+    """
 
     def __init__(
         self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout | None = None
@@ -238,28 +241,33 @@ class BoundSums:
         self._estimator = estimator
         self.n_rows, self._n_equations, self._n_p = W.shape
         columns = np.concatenate([W, b[:, :, None]], axis=2)
-        scale = column_scale(columns)
-        self._scale = np.where(scale > 0.0, scale, 1.0)
-        columns = columns / self._scale
+        size = np.sqrt(np.square(columns.reshape(-1, self._n_p + 1)).mean(axis=0))
+        self.scale = np.where(size > 0.0, size, 1.0)
+        columns = columns / self.scale
         self._upper = np.triu_indices(self._n_p + 1)
         i, j = self._upper
         self._blocks = np.zeros((self.n_rows, len(i)))
         for row in range(W.shape[1]):
             self._blocks += columns[:, row, i] * columns[:, row, j]
-        per_unit = self._scale[:-1] / self._scale[-1]
+        per_unit = self.scale[:-1] / self.scale[-1]
         self._prior_std = np.full(self._n_p, np.inf) if layout is None else layout.prior_std * per_unit
         self._prior_mean = np.zeros(self._n_p) if layout is None else layout.prior_mean * per_unit
         self._has_prior = np.isfinite(self._prior_std)
 
-    def select(self, row_sets: Sequence[IntArray]) -> SelectedSums:
-        return SelectedSums(self, self._gram(row_sets), np.array([len(rows) for rows in row_sets]))
+    def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        gram, n_rows = self.gram(row_sets), np.array([len(rows) for rows in row_sets])
+        return Selection(partial(self._well_defined, gram), partial(self.solve, gram, n_rows))
+
+    def _well_defined(self, gram: FloatArray) -> BoolArray:
+        least = smallest_eigenvalue(self._counting_priors(gram[:, :-1, :-1]))
+        return np.asarray(least > self._estimator.min_eigenvalue)
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         left = len(rows) - np.array([len(group) for group in groups])
-        return self.solve(self._gram([rows]) - self._gram(groups), left)
+        return self.solve(self.gram([rows]) - self.gram(groups), left)
 
     def prior_shifts(self, rows: IntArray) -> FloatArray:
-        gram, n = self._gram([rows]), np.array([len(rows)])
+        gram, n = self.gram([rows]), np.array([len(rows)])
         shifted = [self.solve(gram, n, shift)[0] for shift in self.unit_shifts()]
         return np.array(shifted).reshape(-1, self._n_p) - self.solve(gram, n)
 
@@ -268,21 +276,16 @@ class BoundSums:
         return np.asarray(np.diag(np.where(self._has_prior, self._prior_std, 0.0))[self._has_prior])
 
     def null_space(self) -> NullSpace:
-        gram = self.counting_priors(self._gram([np.arange(self.n_rows)])[0, :-1, :-1])
-        return null_space(gram, self._scale[:-1], self.min_eigenvalue)
+        gram = self._counting_priors(self.gram([np.arange(self.n_rows)])[0, :-1, :-1])
+        return null_space(gram, self.scale[:-1], self._estimator.min_eigenvalue)
 
     def correlations(self) -> FloatArray:
-        gram = self._gram([np.arange(self.n_rows)])
+        gram = self.gram([np.arange(self.n_rows)])
         prior = self.prior_sums(gram, np.array([self.n_rows]))
         own = gram[0, :-1, :-1]
         return correlations(own if prior is None else own + np.diag(prior.weight[0]))
 
-    @property
-    def min_eigenvalue(self) -> float:
-        """Threshold of a well-defined set of rows."""
-        return self._estimator.min_eigenvalue
-
-    def counting_priors(self, gram: FloatArray) -> FloatArray:
+    def _counting_priors(self, gram: FloatArray) -> FloatArray:
         """Sums ``(..., n, n)`` of ``W^T W`` in which each prior is a row of unit size, for tests of their rank."""
         return gram + np.diag(self._has_prior.astype(float)) if self._has_prior.any() else gram
 
@@ -290,7 +293,7 @@ class BoundSums:
         """Parameters in their units from sums, over as many rows, in columns of unit RMS; priors may be shifted."""
         prior = self.prior_sums(gram, n_rows, shift)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self._estimator.solve(gram, prior) * self._scale[-1] / self._scale[:-1])
+            return np.asarray(self._estimator.solve(gram, prior) * self.scale[-1] / self.scale[:-1])
 
     def prior_sums(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> _PriorSums | None:
         """Sums of priors beside those of sets of as many rows; None without priors."""
@@ -303,20 +306,21 @@ class BoundSums:
     def _residual_variance(self, gram: FloatArray, n_rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Variance ``(n_sets,)`` of the residuals of ordinary least squares without priors, and its solutions."""
         G, h = gram[:, :-1, :-1], gram[:, :-1, -1]
-        p = solve_definite(G + _RIDGE * n_rows[:, None, None] * np.eye(self._n_p), h)
+        # A ridge makes the sums definite.
+        p = solve_definite(G + 1e-10 * n_rows[:, None, None] * np.eye(self._n_p), h)
         left = gram[:, -1, -1] - (h * p).sum(axis=1)
         return left / np.maximum(1, n_rows * self._n_equations - self._n_p), p
 
     @cached_property
     def _inflation(self) -> float:
         """Variance of sums of scores over blocks of time, over that of white residuals; one at least."""
-        gram = self._gram([np.arange(self.n_rows)])
+        gram = self.gram([np.arange(self.n_rows)])
         (variance,), (p,) = self._residual_variance(gram, np.array([self.n_rows]))
-        parts = self._gram(list(np.arange(self.n_rows)[:, None]))
+        parts = self.gram(list(np.arange(self.n_rows)[:, None]))
         scores = parts[:, :-1, -1] - parts[:, :-1, :-1] @ p
         return score_inflation(scores, gram[0, :-1, :-1], max(float(variance), _LEAST_NOISE**2))
 
-    def _gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
+    def gram(self, row_sets: Sequence[IntArray]) -> FloatArray:
         """Sums ``(n_sets, n + 1, n + 1)``, each in the order of its rows."""
         sums, by_length = np.empty((len(row_sets), self._blocks.shape[1])), defaultdict[int, list[int]](list)
         for place, own in enumerate(row_sets):
@@ -328,65 +332,6 @@ class BoundSums:
         i, j = self._upper
         gram[:, i, j] = gram[:, j, i] = sums
         return gram
-
-
-class _OfRows(Protocol):
-    """An estimator that tests and fits sets of rows."""
-
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        """Mask of the sets that determine the parameters."""
-
-    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Parameters ``(n_sets, n)``."""
-
-
-@dataclass(frozen=True)
-class SelectedRows:
-    """Sets of rows, for an estimator that fits more than sums."""
-
-    bound: _OfRows
-    row_sets: Sequence[IntArray]
-
-    def well_defined(self) -> BoolArray:
-        return self.bound.well_defined(self.row_sets)
-
-    def fit(self) -> FloatArray:
-        return self.bound.fit(self.row_sets)
-
-
-@dataclass(frozen=True)
-class SelectedSums:
-    """Sums of ``[W b]^T [W b]`` over each set of rows, ``(n_sets, n + 1, n + 1)``, and the number of rows."""
-
-    bound: BoundSums
-    gram: FloatArray
-    n_rows: IntArray
-
-    def well_defined(self) -> BoolArray:
-        gram = self.bound.counting_priors(self.gram[:, :-1, :-1])
-        return np.asarray(smallest_eigenvalue(gram) > self.bound.min_eigenvalue)
-
-    def fit(self) -> FloatArray:
-        return self.bound.solve(self.gram, self.n_rows)
-
-    def prior_sums(self, shift: FloatArray | None = None) -> _PriorSums | None:
-        """Sums of priors."""
-        return self.bound.prior_sums(self.gram, self.n_rows, shift)
-
-
-def column_scale(columns: FloatArray) -> FloatArray:
-    """RMS of each column.
-
-    Parameters
-    ----------
-    columns : (N, r, n) array
-
-    Returns
-    -------
-    (n,) array
-    """
-    flat = columns.reshape(-1, columns.shape[-1])
-    return np.asarray(np.sqrt(np.square(flat).mean(axis=0)))
 
 
 def smallest_eigenvalue(gram: FloatArray) -> FloatArray:

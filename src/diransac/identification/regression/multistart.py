@@ -17,10 +17,8 @@ from diransac.time_limit import check_time
 
 __all__ = ["LeastSquaresProblem", "least_squares"]
 
-# Marquardt's damping at the start, and its bounds: the last is a step of nothing.
-_DAMPING, _BOUNDS = 1e-2, (1e-9, 1e9)
-# Factors of the damping after a better trial, and after another one.
-_BETTER, _WORSE = 0.2, 6.0
+# Bounds of Marquardt's damping: the last is a step of nothing.
+_BOUNDS = (1e-9, 1e9)
 
 
 class LeastSquaresProblem(Protocol):
@@ -59,7 +57,7 @@ def least_squares(
     TimeLimitError
         The time limit was reached.
     """
-    z, damping = z.copy(), np.full(len(z), _DAMPING)
+    z, damping = z.copy(), np.full(len(z), 1e-2)
     cost, gradient, matrix = problem.linearized(z, np.arange(len(z)))
     active = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_steps):
@@ -76,6 +74,6 @@ def least_squares(
         settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])
         to = active[better]
         z[to], cost[to], gradient[to], matrix[to] = (x[better] for x in (trial, *then))
-        damping[active] = np.clip(np.where(better, _BETTER, _WORSE) * damping[active], *_BOUNDS)
+        damping[active] = np.clip(np.where(better, 0.2, 6.0) * damping[active], *_BOUNDS)
         active = active[~settled]
     return z, cost

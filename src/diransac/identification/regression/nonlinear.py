@@ -10,43 +10,36 @@ A Gaussian prior ``p_j = m +- s`` is a further error ``(sigma / s) (p_j - m)`` o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data.dataset import Dataset
+from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.log import Log
+from diransac.data.segment import Segment
 from diransac.errors import DiransacError
 from diransac.identification.regression.estimators import (
     OrdinaryLeastSquares,
-    SelectedRows,
+    Selection,
     correlations,
     smallest_eigenvalue,
     solve_definite,
 )
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.rows import NullSpace, Solution, null_space, regression
+from diransac.identification.regression.rows import MotionRows, NullSpace, Solution, null_space, regression
 from diransac.identification.regression.uncertainty import rows_without, score_inflation
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from diransac.data.dataset import ParameterLayout
-    from diransac.data.segment import Segment
-    from diransac.identification.regression.rows import MotionRows
-    from diransac.model import Model, Parameter
-    from diransac.simulation.compiler import Map
+from diransac.model import Model, Parameter
+from diransac.simulation.compiler import Map
 
 __all__ = ["NonlinearLeastSquares", "ParameterChart"]
 
 
 _ROWS_FOR_STARTS = 100
-# Relative decrease of a sum of squares at which a fit has converged: to rounding.
-_CONVERGED = 1e-14
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
 _LOG_BOUND = 27.6
 
@@ -127,32 +120,32 @@ class BoundNonlinear:
         self._scale = np.sqrt(np.square(self._measured[:, : len(known)]).mean(axis=0))
         self._scale = np.append(self._scale, _standard_deviations(self._measured[:, len(known) :]))
         self._scale[self._scale == 0.0] = 1.0
-        self._chart = ParameterChart(self._layout.bounds)
+        self.chart = ParameterChart(self._layout.bounds)
         self._evaluate = _compiled(model, known, shown)
         self.n_rows = len(self._state)
         self._n_p = len(self._layout)
-        self._starts = self._chart.starts(settings.n_starts)
+        self._starts = self.chart.starts(settings.n_starts)
         self._linear = OrdinaryLeastSquares().bind(dataset) if model.is_affine else None
         if not (model.is_affine or model.nonlinear_parameters):
             determined, values = _solution_of_affine_part(dataset)
-            self._starts[:, determined] = self._chart.clip(self._chart.to_free(values[None]))[:, determined]
+            self._starts[:, determined] = self.chart.clip(self.chart.to_free(values[None]))[:, determined]
         self._inflation = 1.0
         everything = np.arange(self.n_rows)[None]
-        whole = self._chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // 2000)]))
+        whole = self.chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // 2000)]))
         self._starts = np.vstack([whole, self._starts])
-        self.of_all_rows = self._chart.to_parameters(whole)[0]
+        self.of_all_rows = self.chart.to_parameters(whole)[0]
         errors, J = self.errors(everything, whole)
         errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / np.where(scale > 0.0, scale, 1.0)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
-        self._column_scale = scale / self._chart.slope(whole)[0]
+        self._column_scale = scale / self.chart.slope(whole)[0]
         if len(self._layout.with_prior):
             scores = np.einsum("nri,nr->ni", J, np.nan_to_num(errors))
             self._inflation = score_inflation(scores, self._blocks.sum(axis=0), float(np.square(errors).mean()))
 
-    def select(self, row_sets: Sequence[IntArray]) -> SelectedRows:
-        return SelectedRows(self, row_sets)
+    def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        return Selection(partial(self.well_defined, row_sets), partial(self.fit, row_sets))
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
         """Mask of the sets of rows in which the Jacobian at the fit of all rows has full rank."""
@@ -165,7 +158,7 @@ class BoundNonlinear:
 
     def median_errors(self) -> FloatArray:
         """Median error ``(r,)`` of the fit of all rows, over the size of each signal."""
-        errors, _ = self.errors(np.arange(self.n_rows)[None], self._chart.to_free(self.of_all_rows[None]))
+        errors, _ = self.errors(np.arange(self.n_rows)[None], self.chart.to_free(self.of_all_rows[None]))
         return np.median(np.abs(errors.reshape(self.n_rows, -1)), axis=0) + np.finfo(float).tiny
 
     def is_informed_elsewhere(self) -> bool:
@@ -187,7 +180,7 @@ class BoundNonlinear:
 
     def prior_shifts(self, rows: IntArray) -> FloatArray:
         here = self._fit_equal(rows[None])
-        start = self._chart.to_free(here)[:, None]
+        start = self.chart.to_free(here)[:, None]
         shifts = np.diag(self._layout.prior_std)[self._layout.with_prior]
         shifted = [self._likeliest(rows[None], start, np.where(np.isfinite(x), x, 0.0))[0] for x in shifts]
         return np.array(shifted).reshape(-1, self._n_p) - here
@@ -205,7 +198,7 @@ class BoundNonlinear:
         return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        start = self._chart.to_free(self._fit_equal(rows[None]))[:, None]
+        start = self.chart.to_free(self._fit_equal(rows[None]))[:, None]
         return np.array([self._likeliest(rows_without(rows, group)[None], start)[0] for group in groups])
 
     def steps_without(self, groups: Sequence[IntArray], rows: IntArray, p: FloatArray) -> FloatArray:
@@ -219,18 +212,18 @@ class BoundNonlinear:
         p : (n,) array
             Fit of all rows.
         """
-        free, r = self._chart.to_free(p[None]), len(self._scale)
+        free, r = self.chart.to_free(p[None]), len(self._scale)
         errors, J = (x[0].reshape(len(rows), r, *x.shape[2:]) for x in self.errors(rows[None], free))
         H, slope = np.einsum("nri,nrj->ij", J, J), np.einsum("nri,nr->i", J, errors)
         if len(self._layout.with_prior):
             prior = self._prior_errors(np.array([np.square(errors).mean()]), None)
-            of_prior, slopes = (x[0] for x in prior.errors(p[None], self._chart.slope(free)))
+            of_prior, slopes = (x[0] for x in prior.errors(p[None], self.chart.slope(free)))
             H, slope = H + slopes.T @ slopes, slope + slopes.T @ of_prior
         left = np.array([H - np.einsum("nri,nrj->ij", J[x], J[x]) for x in groups])
         slopes = np.array([slope - np.einsum("nri,nr->i", J[x], errors[x]) for x in groups])
         left += 1e-12 * np.einsum("kii->ki", left)[:, :, None] * np.eye(self._n_p)
         steps = np.nan_to_num(solve_definite(left, slopes))
-        return self._chart.to_parameters(self._chart.clip(free - steps))
+        return self.chart.to_parameters(self.chart.clip(free - steps))
 
     def _fit_equal(self, rows: IntArray) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
@@ -242,7 +235,7 @@ class BoundNonlinear:
         best = np.argsort(costs, axis=1, kind="stable")[:, : self._settings.n_followed]
         followed = starts[best]
         if self._linear is not None:
-            solved = self._chart.clip(self._chart.to_free(self._linear.select(list(rows)).fit()))
+            solved = self.chart.clip(self.chart.to_free(self._linear.select(list(rows)).fit()))
             followed = np.concatenate([solved[:, None], followed], axis=1)
         return self._likeliest(rows, followed)
 
@@ -259,7 +252,7 @@ class BoundNonlinear:
             prior = self._prior_errors(least / max(1, rows.shape[1] * len(self._scale) - self._n_p), shift)
             free, costs = self._descend(every, free, prior.of(np.repeat(np.arange(n_sets), n_starts)))
         winner = np.argmin(costs.reshape(n_sets, -1), axis=1)
-        return self._chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
+        return self.chart.to_parameters(free.reshape(n_sets, -1, self._n_p)[np.arange(n_sets), winner])
 
     def _prior_errors(self, variance: FloatArray, shift: FloatArray | None) -> _PriorErrors:
         """Errors of the priors where the errors of the rows have a variance ``(n_sets,)``."""
@@ -275,18 +268,15 @@ class BoundNonlinear:
         self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Free coordinates ``(B, n_p)`` after steps from each start, and their sums of squares."""
-        return least_squares(_Lanes(self, rows, prior), free, self._settings.max_steps, _CONVERGED)
-
-    def clipped(self, free: FloatArray) -> FloatArray:
-        """Free coordinates within their bounds."""
-        return self._chart.clip(free)
+        # Fits converge to rounding.
+        return least_squares(_Lanes(self, rows, prior), free, self._settings.max_steps, 1e-14)
 
     def errors(
         self, rows: IntArray, free: FloatArray, prior: _PriorErrors | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Scaled errors ``(B, n r)`` and their Jacobian ``(B, n r, n_p)`` in free coordinates; those of priors last."""
         n_lanes = len(rows)
-        p, slope = self._chart.to_parameters(free), self._chart.slope(free)
+        p, slope = self.chart.to_parameters(free), self.chart.slope(free)
         flat = rows.reshape(-1)
         own = self._own(p, rows)
         a, da = self._evaluate(self._state[flat], self._inputs[flat], own)
@@ -331,7 +321,7 @@ class _Lanes:
     prior: _PriorErrors | None
 
     def moved(self, now: FloatArray, step: FloatArray) -> FloatArray:
-        return self.bound.clipped(now + step)
+        return self.bound.chart.clip(now + step)
 
     def linearized(self, z: FloatArray, lanes: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         errors, J = self.bound.errors(self.rows[lanes], z, self.prior and self.prior.of(lanes))

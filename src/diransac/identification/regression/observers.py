@@ -1,10 +1,10 @@
 """Observers that follow samples: least squares of simulations for states that nothing measures, and for parameters.
 
-`DrivenStates` are states that no signal measures, simulated from their own equations and driven by all other states.
+`driven_states` are states that no signal measures, simulated from their own equations and driven by all other states.
 An observer compares the accelerations that the equations give to the other velocities with their motion,
 ``e' = a(q, v, u, p) + b (v - e)``: the error ``e - v`` is that of the acceleration, low-pass filtered with bandwidth b.
 
-`Observers` are of all states, and become simulations as their bandwidth falls.  A measured coordinate y corrects a
+`observers` are of all states, and become simulations as their bandwidth falls.  A measured coordinate y corrects a
 critically damped observer, ``q' = v + 2 b (y - q)`` and ``v' = a(q, v, u, p) + b^2 (y - q)``; a measured velocity, or
 state of first order, is corrected by ``b (y - v)``.  Under a high bandwidth b they follow whatever the parameters are,
 and least squares of their errors has few local optima; under a low one they are simulations of the whole log.  Nothing
@@ -21,25 +21,21 @@ parameter estimation" (a coupling to the data that is lowered gradually).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.data.dataset import ParameterLayout
 from diransac.identification.regression.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
+from diransac.model.derivation import Symbols
 from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
-if TYPE_CHECKING:
-    from diransac.data.dataset import ParameterLayout
-    from diransac.model.derivation import Symbols
-
-__all__ = ["DrivenStates", "Observers"]
+__all__ = ["ObserverFit", "driven_states", "observers"]
 
 _N_STARTS = 256
 """Starts at most."""
@@ -124,14 +120,29 @@ def _whole_model(model: Model, sampled: tuple[str, ...]) -> Model:
     return _observer_model(model, model.state, sampled, state_of, corrections)
 
 
-class _Search(ABC):
+@dataclass(frozen=True)
+class ObserverFit:
     """Least squares of observers of all logs; unknown are parameters, and states at the beginning of every log.
 
-    Attributes
+    Made by `driven_states` and `observers`.
+
+    Parameters
     ----------
     model : Model
     layout : ParameterLayout
         Positions of each log's parameters, which come first among the unknowns.
+    observer : Model
+        The model that is simulated.
+    found : tuple of str
+        States of the model that its first states are; their values at the beginning of every log are unknown.
+    compared : tuple of str
+        States of the observer that are compared with samples.
+    samples : (N, n) array
+        Of these, in all rows of all logs.
+    driving : (N, n_d) array
+        Samples that are inputs of the observer.
+    begin : (n_logs, n_found) array
+        States to start from.
     inputs : (N, n_u) array
     readings : (N, n_y) array
         Sensors of the model in all rows; those of weight 0 are not used.
@@ -143,12 +154,20 @@ class _Search(ABC):
         s, and 1/s.
     substeps : int
         Integration steps per sample.
-    parameters : (n_p,) array or None
+    parameters : (n_p,) array, optional
         Known parameters.
+    n_starts : int, optional
+        Number of starts.
     """
 
     model: Model
     layout: ParameterLayout
+    observer: Model
+    found: tuple[str, ...]
+    compared: tuple[str, ...]
+    samples: FloatArray
+    driving: FloatArray
+    begin: FloatArray
     inputs: FloatArray
     readings: FloatArray
     weights: FloatArray
@@ -157,52 +176,19 @@ class _Search(ABC):
     bandwidth: float
     substeps: int
     parameters: FloatArray | None = None
-
-    @property
-    @abstractmethod
-    def _observer(self) -> Model:
-        """The model that is simulated."""
-
-    @property
-    @abstractmethod
-    def _found(self) -> tuple[str, ...]:
-        """States of the model that its first states are; their values at the beginning of every log are unknown."""
-
-    @property
-    @abstractmethod
-    def _compared(self) -> tuple[tuple[str, ...], FloatArray]:
-        """States of the observer that are compared with samples, and these ``(N, n)``."""
-
-    @property
-    @abstractmethod
-    def _driving(self) -> FloatArray:
-        """Samples ``(N, n)`` that are inputs of the observer."""
-
-    @property
-    @abstractmethod
-    def _begin(self) -> FloatArray:
-        """States ``(n_logs, n)`` to start from."""
-
-    @property
-    def _n_starts(self) -> int:
-        """Number of starts."""
-        return _N_STARTS
+    n_starts: int = _N_STARTS
 
     @cached_property
     def _simulator(self) -> Simulator:
-        return rollouts(self._observer, (*self._compared[0], *self._observer.sensors), substeps=self.substeps)
+        return rollouts(self.observer, (*self.compared, *self.observer.sensors), substeps=self.substeps)
 
     @cached_property
     def _inputs(self) -> FloatArray:
         """Inputs (N, n) of the observer; they are held from row to row, so that means of the samples are taken."""
-        means = self._driving.copy()
+        means = self.driving.copy()
         for rows in self.rows_of_logs:
-            means[rows][:-1] = 0.5 * (self._driving[rows][1:] + self._driving[rows][:-1])
+            means[rows][:-1] = 0.5 * (self.driving[rows][1:] + self.driving[rows][:-1])
         return np.hstack([means, self.inputs])
-
-    @cached_property
-    def _measured(self) -> FloatArray:
-        return np.hstack([self._compared[1], self.readings])
 
     @property
     def _n_parameters(self) -> int:
@@ -210,24 +196,24 @@ class _Search(ABC):
 
     def starts(self) -> FloatArray:
         """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, with one set of states."""
-        states = self._begin.reshape(1, -1)
+        states = self.begin.reshape(1, -1)
         if self.parameters is not None:
             return states
-        chart, n = ParameterChart(self.layout.bounds), self._n_starts
-        return np.hstack([chart.to_parameters(chart.starts(n)), np.tile(states, (n, 1))])
+        chart = ParameterChart(self.layout.bounds)
+        return np.hstack([chart.to_parameters(chart.starts(self.n_starts)), np.tile(states, (self.n_starts, 1))])
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""
-        n = len(self._found)
+        n = len(self.found)
         own = self.layout.index[log] if self.parameters is None else np.arange(0)
         return np.concatenate([own, self._n_parameters + n * log + np.arange(n)])
 
     def _batch(self, z: FloatArray, log: int) -> RolloutBatch:
         """Lanes of a log, one per vector of unknowns (n_starts, n); states that are not unknown start at samples."""
-        rows, own, n = self.rows_of_logs[log], z[:, self._places(log)], len(self._found)
+        rows, own, n = self.rows_of_logs[log], z[:, self._places(log)], len(self.found)
         parameters = own[:, :-n] if self.parameters is None else np.tile(self.parameters, (len(z), 1))
         bandwidth = np.full((len(z), 1), self.bandwidth)
-        samples = self._compared[1][rows.start][: len(self._observer.state) - n]
+        samples = self.samples[rows.start][: len(self.observer.state) - n]
         states = np.hstack([own[:, -n:], np.tile(samples, (len(z), 1))])
         return RolloutBatch(np.hstack([parameters, bandwidth]), states, self._inputs[rows], self.dt)
 
@@ -244,10 +230,11 @@ class _Search(ABC):
         """Cost (n_starts,), infinite after a divergence, its gradient / 2 (n_starts, n), and the normal matrix."""
         cost, gradient, matrix = np.zeros(len(z)), np.zeros(z.shape), np.zeros((*z.shape, z.shape[1]))
         free = self.model.parameters if self.parameters is None else ()
-        unknowns = (*free, *self._observer.state[: len(self._found)])
+        unknowns = (*free, *self.observer.state[: len(self.found)])
         for i, rows in enumerate(self.rows_of_logs):
             places, batch = self._places(i), self._batch(z, i)
-            measured = Measurements(self._measured[rows], np.ones(rows.stop - rows.start, bool))
+            compared = np.hstack([self.samples[rows], self.readings[rows]])
+            measured = Measurements(compared, np.ones(len(compared), bool))
             found = self._simulator.gauss_newton(batch, measured, self.weights[rows], unknowns=unknowns)
             cost += found.cost
             gradient[:, places] += found.gradient
@@ -259,75 +246,71 @@ class _Search(ABC):
 
         Of unsampled angles that are the same after a whole turn, those that start within half a turn of zero.
         """
-        model, n, n_all = self.model, len(self._found), len(self._observer.state)
+        model, n, n_all = self.model, len(self.found), len(self.observer.state)
         logs = range(len(self.rows_of_logs))
         series = np.concatenate([self._simulator.trajectories(self._batch(z[None], i))[0] for i in logs])
-        states = dict(zip(self._found, series[:, :n].T.copy(), strict=True))
-        sampled = self._observer.inputs
+        states = dict(zip(self.found, series[:, :n].T.copy(), strict=True))
+        sampled = self.observer.inputs
         _within_half_a_turn(model, {name: x for name, x in states.items() if name not in sampled}, self.rows_of_logs)
         rate_of = dict(zip(model.velocities, model.accelerations, strict=True))
-        rates = zip(self._found, series[:, n_all : n_all + n].T, strict=True)
+        rates = zip(self.found, series[:, n_all : n_all + n].T, strict=True)
         return {**states, **{rate_of[name]: values for name, values in rates if name in rate_of}}
 
 
-@dataclass(frozen=True)
-class DrivenStates(_Search):
+def driven_states(
+    model: Model,
+    layout: ParameterLayout,
+    hidden: tuple[str, ...],
+    states: FloatArray,
+    inputs: FloatArray,
+    readings: FloatArray,
+    weights: FloatArray,
+    rows_of_logs: Sequence[slice],
+    dt: float,
+    bandwidth: float,
+    parameters: FloatArray | None = None,
+    substeps: int = 2,
+) -> ObserverFit:
     """Least squares of states that nothing measures, driven by those of logs.
 
     Parameters
     ----------
     model, layout, inputs, readings, weights, rows_of_logs, dt, bandwidth, parameters, substeps
-        As `_Search`; weights are of the velocities that are not hidden.
+        As `ObserverFit`; weights are of the velocities that are not hidden.
     hidden : tuple of str
         States that nothing measures; they start at zero, a quaternion at (1, 0, 0, 0).
     states : (N, n_x) array
         States of the model in all rows of all logs; those that are hidden are not used.
     """
-
-    model: Model
-    layout: ParameterLayout
-    hidden: tuple[str, ...]
-    states: FloatArray
-    inputs: FloatArray
-    readings: FloatArray
-    weights: FloatArray
-    rows_of_logs: Sequence[slice]
-    dt: float
-    bandwidth: float
-    parameters: FloatArray | None = None
-    substeps: int = 2
-
-    @property
-    def _found(self) -> tuple[str, ...]:
-        return self.hidden
-
-    @cached_property
-    def _observer(self) -> Model:
-        return _driven_model(self.model, self.hidden, tuple(n for n in self.model.velocities if n not in self.hidden))
-
-    @cached_property
-    def _compared(self) -> tuple[tuple[str, ...], FloatArray]:
-        columns = [self.model.state.index(n) for n in self.model.velocities if n not in self.hidden]
-        return self._observer.state[len(self.hidden) :], self.states[:, columns]
-
-    @property
-    def _driving(self) -> FloatArray:
-        return self.states[:, [i for i, n in enumerate(self.model.state) if n not in self.hidden]]
-
-    @property
-    def _begin(self) -> FloatArray:
-        scalars = [self.model.state[four[0]] for four in self.model.quaternions]
-        return np.tile([float(name in scalars) for name in self.hidden], (self.layout.n_logs, 1))
+    observed = tuple(n for n in model.velocities if n not in hidden)
+    observer, scalars = _driven_model(model, hidden, observed), [model.state[four[0]] for four in model.quaternions]
+    samples = states[:, [model.state.index(n) for n in observed]]
+    driving = states[:, [i for i, n in enumerate(model.state) if n not in hidden]]
+    begin, compared = np.tile([float(n in scalars) for n in hidden], (layout.n_logs, 1)), observer.state[len(hidden) :]
+    shown = (inputs, readings, weights, rows_of_logs, dt, bandwidth, substeps)
+    return ObserverFit(model, layout, observer, hidden, compared, samples, driving, begin, *shown, parameters)
 
 
-@dataclass(frozen=True)
-class Observers(_Search):
+def observers(
+    model: Model,
+    layout: ParameterLayout,
+    sampled: tuple[str, ...],
+    samples: FloatArray,
+    inputs: FloatArray,
+    readings: FloatArray,
+    weights: FloatArray,
+    begin: FloatArray,
+    rows_of_logs: Sequence[slice],
+    dt: float,
+    bandwidth: float,
+    substeps: int = 2,
+) -> ObserverFit:
     """Least squares of observers of all states, which begin anywhere; parameters are unknown.
 
     Parameters
     ----------
     model, layout, inputs, readings, weights, rows_of_logs, dt, bandwidth, substeps
-        As `_Search`; weights are of the sampled states, 0 where no sample was taken.
+        As `ObserverFit`; weights are of the sampled states, 0 where no sample was taken.
     sampled : tuple of str
         States that have samples, in the model's order.
     samples : (N, n) array
@@ -335,45 +318,13 @@ class Observers(_Search):
     begin : (n_logs, n_x) array
         States from which the search starts at the beginning of each log.
     """
-
-    model: Model
-    layout: ParameterLayout
-    sampled: tuple[str, ...]
-    samples: FloatArray
-    inputs: FloatArray
-    readings: FloatArray
-    weights: FloatArray
-    begin: FloatArray
-    rows_of_logs: Sequence[slice]
-    dt: float
-    bandwidth: float
-    substeps: int = 2
-
-    @property
-    def _found(self) -> tuple[str, ...]:
-        return self.model.state
-
-    @cached_property
-    def _observer(self) -> Model:
-        return _whole_model(self.model, self.sampled)
-
-    @property
-    def _compared(self) -> tuple[tuple[str, ...], FloatArray]:
-        return tuple(self._observer.state[self.model.state.index(n)] for n in self.sampled), self.samples
-
-    @property
-    def _driving(self) -> FloatArray:
-        return self.samples
-
-    @property
-    def _begin(self) -> FloatArray:
-        return self.begin
-
-    @property
-    def _n_starts(self) -> int:
-        """Fewer of larger problems: numbers of all rows and pairs of unknowns of all starts are bounded."""
-        n = len(self.layout) + self.begin.size
-        return int(np.clip(200_000_000 // (len(self.samples) * n**2), 16, _N_STARTS))
+    observer, n = _whole_model(model, sampled), len(layout) + begin.size
+    compared = tuple(observer.state[model.state.index(name)] for name in sampled)
+    # Fewer starts of larger problems: numbers of all rows and pairs of unknowns of all starts are bounded.
+    n_starts = int(np.clip(200_000_000 // (len(samples) * n**2), 16, _N_STARTS))
+    shown = (inputs, readings, weights, rows_of_logs, dt, bandwidth, substeps)
+    of_all = (model, layout, observer, model.state, compared, samples, samples, begin)
+    return ObserverFit(*of_all, *shown, n_starts=n_starts)
 
 
 @lru_cache(maxsize=64)

@@ -7,23 +7,20 @@ Holland and Welsch 1977 (iteratively reweighted least squares).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
+from diransac.data.dataset import Dataset, ParameterLayout
+from diransac.data.segment import Segment
 from diransac.identification.regression.uncertainty import CLEAR
+from diransac.model import Model
 from diransac.simulation.compiler import compile_map
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, ParameterLayout
-    from diransac.data.segment import Segment
-    from diransac.model import Model
 
 __all__ = [
     "PART_OF_NULL_VECTOR",
@@ -239,14 +236,10 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
     A = (J / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, J.shape[2])
     norms = np.linalg.norm(A, axis=0)
     A = A / np.where(norms > 0.0, norms, 1.0)
-    free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in _each(A)]
+    pairs = ((A[:, k], np.delete(A, k, axis=1)) for k in range(A.shape[1]))
+    free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in pairs]
     # Equations inform about a parameter if the other columns leave a tenth of its own.
     return np.asarray((norms > 0.0) & (np.array(free) > 0.1))
-
-
-def _each(A: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Each column, and the others."""
-    yield from ((A[:, k], np.delete(A, k, axis=1)) for k in range(A.shape[1]))
 
 
 def regression_rows(

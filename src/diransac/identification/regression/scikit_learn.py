@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+from functools import partial
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray
+from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import SettingsError
 from diransac.identification.regression.estimators import (
     MIN_EIGENVALUE,
+    BoundEstimator,
     BoundSums,
     Estimator,
     OrdinaryLeastSquares,
-    SelectedRows,
-    column_scale,
+    Selection,
 )
 from diransac.identification.regression.rows import NullSpace, regression
 from diransac.identification.regression.uncertainty import rows_without
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, ParameterLayout
-    from diransac.identification.regression.estimators import BoundEstimator
 
 __all__ = ["LinearRegressor", "ScikitLearnEstimator", "as_estimator", "name_of"]
 
@@ -76,16 +74,10 @@ class _BoundScikitLearn:
         self._regressor = estimator.regressor
         self._sums = BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b, layout)
         self.n_rows = len(W)
-        scale = column_scale(np.concatenate([W, b[:, :, None]], axis=2))
-        self._scale = np.where(scale > 0.0, scale, 1.0)
-        self._W, self._b = W / self._scale[:-1], b / self._scale[-1]
+        self._W, self._b = W / self._sums.scale[:-1], b / self._sums.scale[-1]
 
-    def select(self, row_sets: Sequence[IntArray]) -> SelectedRows:
-        return SelectedRows(self, row_sets)
-
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        """Mask of the sets of rows that determine the parameters, by their sums."""
-        return self._sums.select(row_sets).well_defined()
+    def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        return Selection(self._sums.select(row_sets).well_defined, partial(self.fit, row_sets))
 
     def null_space(self) -> NullSpace:
         return self._sums.null_space()
@@ -102,11 +94,12 @@ class _BoundScikitLearn:
 
     def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
         """Parameters ``(n_sets, n)`` in their units; priors may be shifted."""
-        prior = self._sums.select(row_sets).prior_sums(shift)
+        n_rows = np.array([len(rows) for rows in row_sets])
+        prior = self._sums.prior_sums(self._sums.gram(row_sets), n_rows, shift)
         roots = np.zeros((len(row_sets), self._W.shape[2])) if prior is None else np.sqrt(prior.weight)
         mean = np.zeros(self._W.shape[2]) if prior is None else prior.mean
         fits = np.array([self._fit_one(rows, root, mean) for rows, root in zip(row_sets, roots, strict=True)])
-        return np.asarray(fits.reshape(len(row_sets), -1) * self._scale[-1] / self._scale[:-1])
+        return np.asarray(fits.reshape(len(row_sets), -1) * self._sums.scale[-1] / self._sums.scale[:-1])
 
     def _fit_one(self, rows: IntArray, root: FloatArray, mean: FloatArray) -> FloatArray:
         """Parameters from rows, and from one row for each prior, by the square root of its weight."""

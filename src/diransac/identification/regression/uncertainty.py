@@ -35,8 +35,6 @@ __all__ = [
 N_BLOCKS = 10
 CLEAR = 3.0
 """Standard errors from which on a difference is no chance."""
-# Points of a quadrature.
-_N_POINTS = 100
 # Draws at a time.
 _N_DRAWS = 1000
 
@@ -159,12 +157,7 @@ def combined(
 
 
 def students_draws(
-    mean: FloatArray,
-    covariance: FloatArray,
-    degrees_of_freedom: int,
-    bounds: Sequence[Parameter],
-    n: int,
-    seed: int,
+    mean: FloatArray, covariance: FloatArray, degrees_of_freedom: int, bounds: Sequence[Parameter], n: int, seed: int
 ) -> FloatArray:
     """Draws ``(n_p, n)`` from Student's t within bounds, the first of which do not depend on their number.
 
@@ -234,7 +227,7 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
 
     # Beyond nine standard deviations a normal distribution has nothing, to rounding errors.
     whole, theta = integral(min(0.5 * math.pi, 9.0 / math.sqrt(n))), 0.0
-    for _ in range(_N_POINTS):
+    for _ in range(100):
         step = ((2.0 * probability - 1.0) * whole - integral(theta)) / float(density(theta))
         theta += step
         if step <= 1e-15 * theta:
@@ -245,4 +238,4 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
 @cache
 def _quadrature() -> tuple[FloatArray, FloatArray]:
     """Points and weights of Gauss-Legendre quadrature on [-1, 1]."""
-    return np.polynomial.legendre.leggauss(_N_POINTS)
+    return np.polynomial.legendre.leggauss(100)

@@ -32,13 +32,6 @@ __all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
 TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 """A user's candidates: ``library(q, v, u)`` returns expressions by name, each of which is tried in every equation."""
 
-# Speed over which sign(v) is smooth, and speeds of the Stribeck effect, over the RMS speed.
-_SMOOTH, _STRIBECK = 0.01, (0.03, 0.06, 0.12, 0.25)
-# Widths of a dead band, and levels of saturation, over the RMS input.
-_DEAD_BANDS, _LEVELS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8), (0.6, 0.8, 1.0, 1.3, 1.7)
-# Largest change of an input's gain; how far a coefficient may leave what an actuator can do, as a part of it.
-_LARGEST_GAIN, _BEYOND = 0.5, 0.5
-
 
 @dataclass(frozen=True)
 class CandidateTerm:
@@ -78,11 +71,6 @@ class CandidateTerm:
     residuals: ca.SX
     bounds: tuple[float, float] = (-np.inf, np.inf)
     name: str = ""
-
-    @property
-    def is_of_input(self) -> bool:
-        """True if the term changes an input."""
-        return self.equation < 0
 
 
 @dataclass(frozen=True)
@@ -239,14 +227,14 @@ class _Maker:
     def _of_own_speed(self, i: int) -> Iterator[CandidateTerm]:
         v, name, code = self.symbols[1][i], list(self.model.velocities)[i], f"v.{self.model.rate_names[i]}"
         unit = list(self.model.velocities.values())[i]
-        speed = float(f"{_SMOOTH * self.speeds[i]:.1g}")
+        speed = float(f"{0.01 * self.speeds[i]:.1g}")
         sign, smooth = ca.tanh(v / speed), f"ca.tanh({code} / {speed:g})"
         yield self._term("Coulomb friction", i, "coulomb", f"sign({name})", smooth, sign, "")
         yield self._term("viscous friction", i, "viscous", name, code, v, unit)
         drag = f"ca.fabs({code}) * {code}"
         yield self._term("quadratic drag", i, "quadratic", f"|{name}| {name}", drag, ca.fabs(v) * v, f"({unit})^2")
         yield self._term("asymmetric drag", i, "current", f"|{name}|", f"ca.fabs({code})", ca.fabs(v), unit)
-        for factor in _STRIBECK:
+        for factor in (0.03, 0.06, 0.12, 0.25):
             slow = float(f"{factor * self.speeds[i]:.2g}")
             yield self._term(
                 "Stribeck friction",
@@ -335,24 +323,24 @@ class _Maker:
     ) -> Iterator[tuple[str, str, str, str, ca.SX, str, tuple[float, float]]]:
         """Kind, label, formula, factor in code, value, and unit and bounds of the coefficient of changes of one input.
 
-        Within the bounds, but for an error of the coefficient, what the actuator gives does not fall with its input; a
-        dead band and saturation take from it.
+        Within the bounds, but for an error of half of the coefficient, what the actuator gives does not fall with its
+        input; a dead band and saturation take from it.
         """
-        most = 1.0 + _BEYOND
-        yield INPUT_GAIN, "gain_error", name, "", u, "1", (-_LARGEST_GAIN, _LARGEST_GAIN)
+        most = 1.5
+        yield INPUT_GAIN, "gain_error", name, "", u, "1", (-0.5, 0.5)
         if not size > 0.0:
             return
         code, per_unit = f"u.{name}", _over("1", "" if unit == "1" else unit)
         yield "input offset", "offset", "", "", ca.SX(1), unit, (-np.inf, np.inf)
         curve, least = f" * ca.fabs({code}) * {code}", -most / (2.0 * largest)
         yield "curved input", "curvature", f"|{name}| {name}", curve, ca.fabs(u) * u, per_unit, (least, np.inf)
-        for factor in _DEAD_BANDS:
+        for factor in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8):
             width = float(f"{factor * size:.2g}")
             limited = f" * ca.fmax(-1, ca.fmin(1, {code} / {width:g}))"
             value = ca.fmax(-1.0, ca.fmin(1.0, u / width))
             formula = f"sign({name}) beyond {width:g}"
             yield "dead band", "dead_band", formula, limited, value, unit, (-most * width, 0.0)
-        for factor in _LEVELS:
+        for factor in (0.6, 0.8, 1.0, 1.3, 1.7):
             level = float(f"{factor * size:.2g}")
             beyond = f" * ({code} - ca.fmax(-{level:g}, ca.fmin({level:g}, {code})))"
             value = u - ca.fmax(-level, ca.fmin(level, u))

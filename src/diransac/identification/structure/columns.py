@@ -45,15 +45,11 @@ _UNITS += ("A", "mA", "K", "s", "ms")
 _TINY = 1e-300
 _OFFSETS = {"K": ("degC", 1.0, 273.15)}
 # Samples over which changes are compared with integrals of derivatives; scatter of their ratios that is agreement, and
-# largest logarithm of a ratio over that of a unit; part of the samples that both columns need.
-_SPANS, _AGREES, _SAME_FACTOR, _KNOWN = (1, 4, 16, 64, 256), 0.25, 0.1, 0.05
-# Residual over that without the correction from which on it explains a log much better, and as well; that of the next
-# best correction over it.  Part of the terms of an equation from which on it does not hold.
-_MUCH_BETTER, _AS_GOOD, _DISTINCT, _HOLDS = 0.5, 1.05, 1.5, 0.5
-# Samples of the running median that leaves out outliers.
-_MEDIAN = 5
-# Rows of a log that are enough to find a mistake.
-_ENOUGH = 20_000
+# largest logarithm of a ratio over that of a unit.
+_SPANS, _AGREES, _SAME_FACTOR = (1, 4, 16, 64, 256), 0.25, 0.1
+# Residual over that without the correction from which on it explains a log much better; that of the next best
+# correction over it.
+_MUCH_BETTER, _DISTINCT = 0.5, 1.5
 
 
 @dataclass(frozen=True)
@@ -118,8 +114,9 @@ def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mista
 
 def _middle(log: Log) -> Log:
     """The middle of a long log, which is enough to find a mistake."""
-    first = max(0, (len(log) - _ENOUGH) // 2)
-    return log[first : first + _ENOUGH] if first else log
+    enough = 20_000
+    first = max(0, (len(log) - enough) // 2)
+    return log[first : first + enough] if first else log
 
 
 def _zero_inputs(dataset: Dataset) -> list[Mistake]:
@@ -313,10 +310,10 @@ def _changes(low: FloatArray, high: FloatArray, dt: float, order: int, span: int
 def _filled(x: FloatArray) -> FloatArray | None:
     """A column without single outliers, with its gaps interpolated; None where too few samples are known."""
     known = np.flatnonzero(np.isfinite(x))
-    if len(known) < max(_MEDIAN, _KNOWN * len(x)):
+    if len(known) < max(5, 0.05 * len(x)):
         return None
-    middle = np.median(np.lib.stride_tricks.sliding_window_view(x[known], _MEDIAN), axis=1)
-    return np.interp(np.arange(len(x)), known[_MEDIAN // 2 : -(_MEDIAN // 2)], middle)
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(x[known], 5), axis=1)
+    return np.interp(np.arange(len(x)), known[2:-2], middle)
 
 
 # ---------------------------------------------------------------------- columns and the equations
@@ -395,8 +392,8 @@ def _within_bounds(
     Equations that leave most of their terms are those of noise, whose least squares gives any sign.
     """
     outside = outside_bounds(layout, found)
-    holding = [x for x in possible if (x.solution.residuals < _HOLDS).all()]
-    as_good = [x for x in holding if outside and x.solution.residual < _AS_GOOD * found.residual]
+    holding = [x for x in possible if (x.solution.residuals < 0.5).all()]
+    as_good = [x for x in holding if outside and x.solution.residual < 1.05 * found.residual]
     fewest = min((len(x.names) for x in as_good), default=0)
     as_good = [x for x in as_good if len(x.names) == fewest]
     signs = [x for x in as_good if x.factor < 0.0]

@@ -31,8 +31,6 @@ __all__ = [
     "vague_parameters",
 ]
 
-# Eigenvalue of a correlation matrix below which parameters are collinear, and entry that takes part.
-_COLLINEAR, _PART_OF_CORRELATION = 0.05, 0.2
 # Largest difference of equal projectors.
 _SAME = 1e-5
 
@@ -273,8 +271,9 @@ def collinear(
     weak = np.flatnonzero(uncertain & (np.diag(covariance) > 0.0) & np.isfinite(covariance).all(axis=1))
     errors = np.sqrt(np.diag(covariance)[weak])
     sizes, vectors = np.linalg.eigh(covariance[np.ix_(weak, weak)] / errors[:, None] / errors)
-    determined = vectors[:, sizes < _COLLINEAR].T
-    determined = np.where(np.abs(determined) > _PART_OF_CORRELATION, determined, 0.0)
+    # Small eigenvalues of a correlation matrix are those of collinear parameters.
+    determined = vectors[:, sizes < 0.05].T
+    determined = np.where(np.abs(determined) > 0.2, determined, 0.0)
     found, left = [], np.flatnonzero(uncertain).tolist()
     for group in components(determined, 0.0):
         own, rows = weak[group].tolist(), determined[determined[:, group].any(axis=1)][:, group]

@@ -20,18 +20,17 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import SettingsError
 from diransac.identification.regression.uncertainty import combined
 from diransac.identification.settings import finite_number
+from diransac.identification.structure.lacking_terms import Suggestion
 from diransac.identification.structure.structural import structural, structural_slopes
-from diransac.model import expressions
+from diransac.model import Model, expressions
 
 if TYPE_CHECKING:
-    from diransac.arrays import FloatArray
     from diransac.identification.estimate import Estimate
-    from diransac.identification.structure.lacking_terms import Suggestion
-    from diransac.model import Model
 
 __all__ = ["KnownParameters"]
 

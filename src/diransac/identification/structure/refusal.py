@@ -8,12 +8,12 @@ Ljung and Box 1978 (serial correlation).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import rows_per_sample
+from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
@@ -21,10 +21,7 @@ from diransac.identification.regression.uncertainty import CLEAR, robust_std
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, ParameterLayout
-    from diransac.model import Model
+from diransac.model import Model
 
 __all__ = ["cause_of_refusal", "check_known_terms", "check_motion", "check_signs"]
 
@@ -78,13 +75,9 @@ def _moves(values: FloatArray) -> bool:
     if correlation > max(0.1, CLEAR / np.sqrt(known.sum())):
         return True
     good = values[known]
-    near, far = (_small_difference(good, apart) for apart in (1, len(good) // 3))
+    # The 10 % quantile of the differences of neighbours, and of distant samples.
+    near, far = (np.quantile(np.abs(good[apart:] - good[:-apart]), 0.1) for apart in (1, len(good) // 3))
     return bool(near < 0.5 * far and len(good) > 150)
-
-
-def _small_difference(values: FloatArray, apart: int) -> float:
-    """The 10 % quantile of the differences of samples that are so many apart."""
-    return float(np.quantile(np.abs(values[apart:] - values[:-apart]), 0.1))
 
 
 def _samples_held(values: FloatArray) -> int:

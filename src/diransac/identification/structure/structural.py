@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.data.dataset import ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, residual_slopes
 from diransac.identification.structure.identifiability import (
@@ -28,10 +28,7 @@ from diransac.identification.structure.identifiability import (
     joined,
     of_logs,
 )
-
-if TYPE_CHECKING:
-    from diransac.data.dataset import ParameterLayout
-    from diransac.model import Model, Parameter
+from diransac.model import Model, Parameter
 
 __all__ = ["Ranges", "check_structure", "structural", "structural_slopes", "unidentifiable"]
 
@@ -40,9 +37,8 @@ __all__ = ["Ranges", "check_structure", "structural", "structural_slopes", "unid
 _HALF_RANGE = 10.0
 
 
-# Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades;
-# entry of a null vector that is not zero.
-_RANK, _RANK_OF_OUTPUTS, _PART = 1e-9, 1e-12, 1e-5
+# Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades.
+_RANK, _RANK_OF_OUTPUTS = 1e-9, 1e-12
 Ranges = tuple[tuple[str, float, float], ...]
 """Smallest and largest value of states and inputs, by name."""
 
@@ -97,7 +93,7 @@ def structural(
         return ()
     names = np.array(list(model.parameters))[free]
     found = []
-    for group in components(spaces[0].directions, _PART):
+    for group in components(spaces[0].directions, 1e-5):
         parts = [x.of(group) for x in spaces]
         found.append(ambiguity_of(names[group].tolist(), parts, [p[free][group] for p in vectors]))
     if measured is not None:
@@ -123,11 +119,7 @@ def _in_equations(model: Model) -> set[str]:
 
 
 def check_structure(
-    model: Model,
-    source: str,
-    allow: int = 0,
-    measured: tuple[str, ...] | None = None,
-    ranges: Ranges | None = None,
+    model: Model, source: str, allow: int = 0, measured: tuple[str, ...] | None = None, ranges: Ranges | None = None
 ) -> None:
     """Raise IdentificationError for parameters that the equations do not determine, whatever the motion.
 

@@ -3,15 +3,13 @@
 | file | content |
 |---|---|
 | `tracker.py` | `Tracker` and `track`: samples in, estimates out |
-| `estimates.py` | `TrackedEstimate`, `Change` |
-| `stream.py` | samples on the grid of their clock; gaps, restarts, late and repeated ones |
-| `setup.py` | the problem, and intervals of a stream |
-| `starting.py`, `cold_start.py` | the first window, and a start by the default method |
-| `window.py`, `marginal.py` | the fit of the last intervals, and what remains of those before |
+| `estimates.py` | `TrackedEstimate`, `Change`; their `History` |
+| `stream.py` | samples on the grid of their clock; gaps, restarts, late and repeated ones; sensors that stop |
+| `starting.py` | the problem, the first window, and a start by the default method |
+| `window.py` | the fit of the last intervals, and what remains of those before |
 | `changes.py` | steps and drifts of parameters: tested, released, reported |
-| `step_tests.py`, `forces.py`, `drift.py`, `doubt.py` | their tests; forces; rates; changes that remain possible |
+| `step_tests.py`, `forces.py` | their tests; unmodelled forces that explain as much |
 | `surprise.py` | outliers where a machine may have changed |
-| `sensors.py` | sensors that stop |
 """
 
 from diransac.identification.tracking.estimates import Change, TrackedEstimate

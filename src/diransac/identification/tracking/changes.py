@@ -1,37 +1,37 @@
-"""Changes of the parameters while a machine runs: when one is declared, what follows, and when it is reported."""
+"""Changes of the parameters while a machine runs: when one is declared, what follows, and when it is reported.
+
+`Drift` has the rates at which parameters drift, `Doubt` the changes that a window cannot exclude.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.tracking.doubt import Doubt
-from diransac.identification.tracking.drift import Drift
+from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.tracking.estimates import Change
 from diransac.identification.tracking.forces import explanations_by_forces, with_forces
 from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
 
 if TYPE_CHECKING:
     from diransac.data.dataset import ParameterLayout
-    from diransac.identification.tracking.setup import Setup
+    from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.window import Linearization, Window
 
 __all__ = ["Changes"]
 
-# Time over which the scatter of the tests is remembered, s, and tests as they should be that count beside it.
-_MEMORY, _AS_EXPECTED = 60.0, 20.0
-# Windows from whose tests their scatter is known, where the model has not been exact.
-_LEARNED = 3.0
-# Standard errors within which a parameter has returned to an earlier value.
-_RETURNED = 3.0
-# Changes that are remembered; ages that are tested at most, those of a window of 2^30 intervals.
-_REMEMBERED, _MOST_AGES = 32, 32
-# Kind of a change that goes on, in `ChangeTests`.
-_RAMP = 1
+# Time over which the scatter of the tests, and drifts, are remembered, s.
+_MEMORY = 60.0
+# Ages that are tested at most: those of a window of 2^30 intervals.
+_MOST_AGES = 32
+# Standard deviations of the changes by a drift in a second, over the size of a parameter.
+_RATES = np.concatenate([[0.0], np.logspace(-6.0, -1.0, 16)])
+# Evidence, nats, from which on a parameter drifts, or a change counts that no force has been asked to explain.
+_CLEAR = 3.0
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,113 @@ def _explanation(
         if layout.violations(changed):
             best = int(np.argmax(single[0, age]))
             of_steps[age], chosen[age] = single[0, age, best], np.arange(len(values)) == best
-    age, of_ramp = int(np.argmax(of_steps)), float(single[_RAMP].max())
+    age, of_ramp = int(np.argmax(of_steps)), float(single[1].max())
     if of_ramp > of_steps[age]:
         return _Explanation(evidence + of_ramp, tests, age, np.zeros(len(values), bool))
     return _Explanation(evidence + float(of_steps[age]), tests, age, chosen[age])
+
+
+class Drift:
+    """Random walks of the parameters, whose rates follow from how much windows differ from what was known before them.
+
+    The variance of a parameter that drifts grows by q per second.  The estimate of a window alone differs from that of
+    everything before by more than their variances then.  The rate is the likeliest of a grid, with 0 as long as another
+    is not clearly likelier.
+
+    Parameters
+    ----------
+    names : tuple of str
+    given : mapping of str to float
+        Standard deviations of the changes in a second, of parameters whose drift is not estimated.
+    """
+
+    def __init__(self, names: tuple[str, ...], given: Mapping[str, float]) -> None:
+        self.given = np.array([given.get(name, np.nan) for name in names])
+        self.likelihood = np.zeros((len(names), len(_RATES)))
+        self.rate = np.nan_to_num(np.square(self.given))
+
+    def learn(
+        self, values: FloatArray, size: FloatArray, information: FloatArray, window: float, weight: float
+    ) -> None:
+        """Update the rates by the difference of a window from what was known before it.
+
+        Parameters
+        ----------
+        values : (n,) array
+            Parameters.
+        size, information : (n,) array
+            Differences, and their inverse variances; 0 of those that are not determined or not to be counted.
+        window : float
+            Duration of the window, s.
+        weight : float
+            Part of the window that is new.
+        """
+        known = information > 0.0
+        variance = 1.0 / np.where(known, information, 1.0)
+        rates = np.square(np.abs(values)[:, None] * _RATES)
+        more = (rates - self.rate[:, None]) * window
+        # Some of the variance of a difference is no drift.
+        total = np.maximum(variance[:, None] + more, 0.05 * variance[:, None])
+        gain = -0.5 * (np.log(total) + np.square(size)[:, None] / total)
+        self.likelihood *= np.exp(-weight * window / _MEMORY)
+        # A single window, however much it differs, is no drift.
+        self.likelihood[known] += weight * np.minimum(gain - gain[:, :1], 2.0)[known]
+        best = np.argmax(self.likelihood, axis=1)
+        clear = self.likelihood.max(axis=1) > self.likelihood[:, 0] + _CLEAR
+        own = np.arange(len(best))
+        estimated = np.where(clear, rates[own, best], 0.0)
+        self.rate = np.where(np.isnan(self.given), estimated, np.square(self.given))
+
+    @property
+    def drifting(self) -> BoolArray:
+        """Parameters ``(n,)`` that drift."""
+        return np.asarray(self.rate > 0.0)
+
+
+class Doubt:
+    """Variances that changes which a window cannot exclude add to those of n parameters.
+
+    - What was known of a parameter before the window contradicts the window, but unmodelled forces explain that nearly
+      as well as a change does: it may be either value.
+    - A machine of which one parameter has changed may have changed in others, as a payload takes its inertia with it.
+      Each may have changed by the same ratio until the motion since then tells that it has not.
+
+    Parameters
+    ----------
+    n : int
+
+    Attributes
+    ----------
+    variance : (n,) array
+    """
+
+    def __init__(self, n: int) -> None:
+        self.variance = np.zeros(n)
+        self._ratio = 0.0
+
+    def since(self, ratio: float) -> None:
+        """Doubt all parameters: one has changed by this ratio where the window begins."""
+        self._ratio = min(abs(ratio), 1.0)
+
+    def update(self, tests: ChangeTests, values: FloatArray, certain: Sequence[int], *, full: bool) -> None:
+        """Doubt what the tests of a window leave open.
+
+        Parameters
+        ----------
+        tests : ChangeTests
+        values : (n,) array
+            Parameters.
+        certain : sequence of int
+            Parameters that are known to have changed.
+        full : bool
+            Whether the window is full, so that it has begun with no change.
+        """
+        self._ratio = 0.0 if full else self._ratio
+        contradicted = tests.gain(values)[:, -1] > _CLEAR
+        possible = np.square(self._ratio * values)
+        possible[list(certain)] = 0.0
+        self.variance = np.where(contradicted, np.square(tests.size[:, -1]), 0.0).max(axis=0)
+        self.variance += possible / (1.0 + possible * tests.information[0, -1])
 
 
 class Changes:
@@ -128,7 +231,8 @@ class Changes:
         if is_full:
             self._learn_drift(window, tests)
             self._learned += np.inf if window.is_exact or window.setup.exact else self.step
-        calibrated = self._learned > _LEARNED * self._duration(window)
+        # The scatter of a model that is not exact is known after three windows.
+        calibrated = self._learned > 3.0 * self._duration(window)
         fires = gain > self._price(tests.ages)
         if is_full and not (fires and calibrated):
             self._learn_scatter(tests)
@@ -168,7 +272,8 @@ class Changes:
     def _scatter(self, ages: IntArray, n: int) -> FloatArray:
         """Variance ``(2, A, n_p)`` of the ratios of tests of some ages in n intervals, as remembered; 1 at least."""
         places = self._places(ages, n)
-        found = (self._squares[:, places] + _AS_EXPECTED) / (self._counts[:, places] + _AS_EXPECTED)
+        # Twenty tests as they should be count, too.
+        found = (self._squares[:, places] + 20.0) / (self._counts[:, places] + 20.0)
         return np.asarray(np.maximum(found, 1.0))
 
     def _places(self, ages: IntArray, n: int) -> IntArray:
@@ -261,10 +366,10 @@ class Changes:
         """Report a change, as a return where it ends at a value from before an earlier one."""
         name = self.names[one.index]
         earlier = [x for x in self._reported if x.parameter == name]
-        back = any(abs(after - x.before) < _RETURNED * np.hypot(error, x.before_error) for x in earlier)
+        back = any(abs(after - x.before) < CLEAR * np.hypot(error, x.before_error) for x in earlier)
         found: Literal["step", "drift", "return"] = "return" if back else kind
         change = Change(one.time, name, one.before, after, found, now, one.before_error, error)
-        self._reported = [*self._reported, change][-_REMEMBERED:]
+        self._reported = [*self._reported, change][-32:]
         self._new.append(change)
 
     def covariance(self, window: Window) -> FloatArray:

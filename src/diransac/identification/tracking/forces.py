@@ -18,11 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
 
-# Factors by which unmodelled accelerations may be larger than usual, their correlation then, and the number of the
-# last intervals that a gust may be in.
-_FACTORS, _GUST, _RECENT = 6.0 ** np.arange(4), 0.9, 8
-# Unmodelled accelerations that are large, over those that are expected.
-_LARGE = 30.0
+# Correlation of unmodelled accelerations that are larger than usual.
+_GUST = 0.9
 
 
 class _Terms(NamedTuple):
@@ -98,8 +95,8 @@ def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterat
     yield found, evidence
     larger = [
         np.where((np.arange(W) >= W - age)[:, None], factor * least, usual)
-        for age in (min(_RECENT, W), W)
-        for factor in _FACTORS
+        for age in (min(8, W), W)
+        for factor in 6.0 ** np.arange(4)
     ]
     strongest: list[tuple[Linearization, float]] = []
     most = 0.0
@@ -132,7 +129,7 @@ def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArra
     """
     none = np.zeros_like(least)
     exact = _evidence(with_forces(found, least, none))
-    others = [(expected, none), (_LARGE * expected, none + _GUST)]
+    others = [(expected, none), (30.0 * expected, none + _GUST)]
     if (found.fit.tau > least).any():
         others = [(found.fit.tau, found.fit.rho)]
     return max(_evidence(with_forces(found, *x)) for x in others) - exact

@@ -1,34 +1,120 @@
-"""Beginning of a window: smoothed states of its intervals, and a first fit with the parameters of a start."""
+"""The problem that a tracker solves, and its start: given or found by the default method, and the first window."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.dataset import Dataset, ParameterLayout
+from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
+from diransac.data.segment import long_runs
+from diransac.errors import DiransacError
+from diransac.identification.identify import identify
+from diransac.identification.methods.lo_diransac import LoDiransac
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
+from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion
-from diransac.identification.tracking.window import Window
+from diransac.identification.tracking.window import AS_LIKELY, Window
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.tracking.setup import Setup
+    from diransac.identification.result import Result
     from diransac.identification.tracking.stream import Stream
+    from diransac.model import Model
 
-__all__ = ["Start", "begun", "smoothed_motion"]
+__all__ = ["ColdStart", "Setup", "Start", "begun", "smoothed_motion"]
 
-# Prior standard deviation of a parameter of which only a rough value is known, over the value.
-_ROUGH = 1.0
-# Evidence, nats, by which inputs that are interpolated must be likelier than held ones; as in `local_search`.
-_AS_LIKELY = 5.0
+
+@dataclass(frozen=True)
+class Setup:
+    """Model, settings and timing of a tracker.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+        Of one log.
+    hold : str, optional
+        Inputs between samples, one of `HOLDS`.
+    timing : InputTiming, optional
+        Delay and lag after which recorded inputs act.
+    settings : LoDiransacSettings, optional
+        Of the joint fit.
+    exact : bool, optional
+        Whether an identification has predicted its logs within their noise.
+    """
+
+    model: Model
+    layout: ParameterLayout
+    hold: str = "zero-order"
+    timing: InputTiming = field(default_factory=InputTiming)
+    settings: LoDiransacSettings = field(default_factory=LoDiransacSettings)
+    exact: bool = False
+
+    @property
+    def n_signals(self) -> int:
+        """Number of the columns of a stream that are signals; the others are inputs."""
+        return len(self.model.signals)
+
+    def intervals(self, stream: Stream, first: int, n: int) -> ShootingIntervals:
+        """Intervals of a stream.
+
+        Parameters
+        ----------
+        stream : Stream
+        first : int
+            Row of the stream with which they begin.
+        n : int
+            Number of intervals.
+
+        Returns
+        -------
+        ShootingIntervals
+        """
+        length = stream.length // stream.parts
+        held = stream.values[: first - stream.first + n * length]
+        rows = slice(first - stream.first, len(held))
+        measured = held[rows, : self.n_signals]
+        known = np.isfinite(measured)
+        missing = np.asarray(np.isnan(held[:, self.n_signals :]).any(axis=1))
+        inputs = _interpolated(held[:, self.n_signals :])
+        acting = self.timing.acting(inputs, stream.dt, self.hold)[rows]
+        return ShootingIntervals(
+            model=self.model,
+            layout=self.layout,
+            measured=np.where(known, measured, 0.0),
+            sampled=known,
+            recorded=acting,
+            is_logged=np.ones(n * length, bool),
+            # Three rows without an input are a gap, as in `data.segment.bind_log`.
+            gaps=(stream.ended[: len(held)] | long_runs(missing, 3))[rows],
+            log_of=np.zeros(n, np.int64),
+            dt=stream.dt,
+            length=length,
+            substeps=self.settings.substeps,
+            hold=self.hold,
+            discrepancies=False,
+        )
+
+
+def _interpolated(inputs: FloatArray) -> FloatArray:
+    """Inputs ``(N, n_u)`` with missing samples interpolated, and held at both ends; 0 without any sample."""
+    filled, rows = inputs.copy(), np.arange(len(inputs))
+    for column in filled.T:
+        known = np.isfinite(column)
+        if not known.all():
+            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
+    return filled
 
 
 @dataclass(frozen=True)
@@ -113,7 +199,7 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     best = _fitted(replace(setup, hold=first_hold), stream, first, n, given, motion)
     for hold in others:
         other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
-        best = other if other.cost < best.cost - _AS_LIKELY else best
+        best = other if other.cost < best.cost - AS_LIKELY else best
     few = with_fewest_steps(best.setup.intervals(stream, first, n), best.fit, setup.settings.substeps).substeps
     begun_setup = replace(best.setup, settings=replace(setup.settings, substeps=few))
     return Window(begun_setup, stream, first, best.fit, motion.spread, most)
@@ -132,7 +218,7 @@ def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, moti
     intervals, p = setup.intervals(stream, first, n), given.parameters
     if given.covariance is None:
         unit = parameter_units(intervals, motion, p)
-        covariance = np.diag(np.square(_ROUGH * np.maximum(np.abs(p), np.where(unit > 0.0, unit, 1.0))))
+        covariance = np.diag(np.square(np.maximum(np.abs(p), np.where(unit > 0.0, unit, 1.0))))
     else:
         covariance = given.covariance
     std = np.sqrt(np.diag(covariance))
@@ -156,3 +242,87 @@ def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:
     boundary = BoundaryPrior.of_information(point, information, np.zeros(len(point)))
     none = np.zeros_like(fit.prior)
     return replace(fit, boundary=boundary, prior=none + np.inf, prior_mean=none)
+
+
+# ---------------------------------------------------------------------- a start by the default method
+
+
+class ColdStart:
+    """Identification of the rows that a stream holds: of one window, then of twice as many, a window apart at least.
+
+    Parameters
+    ----------
+    setup : Setup
+    seed : int
+    window : float
+        Time from which on the first rows are identified, s.
+    background : bool
+        Whether `sought` returns while an identification runs.
+
+    Attributes
+    ----------
+    refused : str
+        Why there is no start yet.
+    """
+
+    def __init__(self, setup: Setup, seed: int, window: float, *, background: bool) -> None:
+        self.setup, self.seed, self.window, self.background = setup, seed, window, background
+        self._running: Future[Result] | None = None
+        self._needed, self._not_before = window, 0
+        self.refused = f"there are fewer than {window:g} s of rows"
+
+    def restart(self) -> None:
+        """Begin again with the rows of one window."""
+        self._running, self._needed = None, self.window
+
+    def sought(self, stream: Stream, end: int) -> tuple[Setup, Start, str] | None:
+        """The problem with the timing of its inputs, its start and a note, once there is one that is usable.
+
+        Parameters
+        ----------
+        stream : Stream
+        end : int
+            Row after the newest one.
+        """
+        first = max(stream.first, stream.fresh)
+        enough = (end - first) * stream.dt >= self._needed and end >= self._not_before
+        if self._running is None and enough:
+            self._not_before = end + round(self.window / stream.dt)
+            self._running = self._identified(stream, first, end)
+        if self._running is None or (self.background and not self._running.done()):
+            return None
+        running, self._running = self._running, None
+        seconds = f"an identification of {self._needed:.3g} s"
+        try:
+            result = running.result()
+            self.refused = f'{seconds} says "{result.verdict}"'
+        except DiransacError as error:
+            self.refused = f"{seconds} fails: {error}"
+            result = None
+        if result is None or result.verdict == "do not rely on this":
+            self._needed = min(2.0 * self._needed, len(stream.values) * stream.dt - self.window)
+            return None
+        resolution = result.estimate.resolution
+        setup = replace(self.setup, timing=resolution.timing, exact=result.estimate.competition is None)
+        said = f"identified from the first {self._needed:.3g} s ({result.verdict})"
+        start = Start(np.array(list(result.parameters.values())), holds=(resolution.hold,))
+        return setup, start, said
+
+    def _identified(self, stream: Stream, first: int, end: int) -> Future[Result]:
+        """The identification of some rows, which runs."""
+        rows = stream.values[first - stream.first : end - stream.first]
+        names = (*self.setup.model.signals, *self.setup.model.inputs)
+        columns = {n: x.copy() for n, x in zip(names, rows.T, strict=True) if np.isfinite(x).any()}
+        log = Log.from_arrays(stream.time(first) + stream.dt * np.arange(len(rows)), columns, source="the stream")
+        method = LoDiransac(suggestions=False)
+        if self.background:
+            pool = ThreadPoolExecutor(1, thread_name_prefix="identification")
+            running = pool.submit(identify, self.setup.model, log, method, seed=self.seed)
+            pool.shutdown(wait=False)
+            return running
+        done: Future[Result] = Future()
+        try:
+            done.set_result(identify(self.setup.model, log, method, seed=self.seed))
+        except DiransacError as error:
+            done.set_exception(error)
+        return done

@@ -24,16 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ChangeTests", "ages_of", "change_tests", "fine_ages_of"]
 
-# Part of the information of a change that the other unknowns must leave, for it to be determined.
-_DETERMINED = 1e-9
-# Ratio of neighbouring ages of changes that are compared.
-_FINELY = 1.2
-# Change of a parameter that is expected of a machine, over the parameter.
-_USUAL_CHANGE = 1.0
-# Evidence, nats, that the change of another parameter at the same time must add; part of its information that those
-# before must leave; and least variance of a change.
-_MORE, _LEFT, _LEAST = 10.0, 1e-3, 1e-300
-
 
 @dataclass(frozen=True)
 class ChangeTests:
@@ -65,7 +55,7 @@ class ChangeTests:
         return self.size * np.sqrt(self.information)
 
     def gain(self, values: FloatArray, scatter: FloatArray | float = 1.0) -> FloatArray:
-        """Logarithms of the Bayes factors of the changes, as eq. (8) of `docs/method.md`.
+        """Logarithms of the Bayes factors of changes as large as the parameters, as eq. (8) of `docs/method.md`.
 
         Parameters
         ----------
@@ -79,7 +69,7 @@ class ChangeTests:
         (2, A, n) array
         """
         information = self.information / scatter
-        return _gain(self.size * information, information, np.square(_USUAL_CHANGE * values))
+        return _gain(self.size * information, information, np.square(values))
 
     def steps_at_once(self, values: FloatArray, scatter: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Steps of several parameters at the same time: one after the other is added as long as the evidence grows.
@@ -98,19 +88,20 @@ class ChangeTests:
         (A, n) bool array
             Parameters that change.
         """
-        ages, prior = np.arange(len(self.ages)), np.square(_USUAL_CHANGE * values)
+        ages, prior = np.arange(len(self.ages)), np.square(values)
         std = np.sqrt(scatter)
         M, score = self.of_steps / (std[:, :, None] * std[:, None, :]), self.size[0] * self.information[0] / scatter
         own, total, chosen = self.information[0] / scatter, np.zeros(len(ages)), np.zeros(score.shape, bool)
         for k in range(len(values)):
             left = np.maximum(np.einsum("ajj->aj", M), 0.0)
-            more = np.where(left > _LEFT * own, _gain(score, left, prior), -np.inf)
+            # Those before must leave some of the information of another parameter, which must add clear evidence.
+            more = np.where(left > 1e-3 * own, _gain(score, left, prior), -np.inf)
             j = np.argmax(more, axis=1)
-            grows = more[ages, j] > (_MORE if k else 0.0)
+            grows = more[ages, j] > (10.0 if k else 0.0)
             if not grows.any():
                 break
             column = M[ages, :, j] * grows[:, None]
-            pivot = left[ages, j] + 1.0 / np.maximum(prior[j], _LEAST)
+            pivot = left[ages, j] + 1.0 / np.maximum(prior[j], 1e-300)
             total += np.where(grows, more[ages, j], 0.0)
             chosen[ages[grows], j[grows]] = True
             score = score - column * (score[ages, j] / pivot)[:, None]
@@ -154,7 +145,7 @@ def fine_ages_of(n: int) -> IntArray:
     -------
     (A,) int array
     """
-    powers = _FINELY ** np.arange(3, 1 + np.ceil(np.log(n) / np.log(_FINELY)))
+    powers = 1.2 ** np.arange(3, 1 + np.ceil(np.log(n) / np.log(1.2)))
     return np.unique(np.minimum(np.round([*powers, n]), n)).astype(np.int64)
 
 
@@ -190,7 +181,8 @@ def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:
     of_steps = np.einsum("cw,wjl->cjl", np.square(c[:A]), at.corners) - np.einsum("icj,icl->cjl", of_s[:, :A], s[:, :A])
     of_steps -= np.einsum("wkcj,wkcl->cjl", of_z[:, :, :A], z[:, :, :A], optimize=True)
     score += np.einsum("wk,wkcj->cj", at.right_z, z) + np.einsum("i,icj->cj", at.right_s, s)
-    information = np.where(information > _DETERMINED * direct, information, 0.0)
+    # The other unknowns must leave some of the information of a change.
+    information = np.where(information > 1e-9 * direct, information, 0.0)
     size = np.divide(-score, information, out=np.zeros_like(score), where=information > 0.0)
     shape = (2, A, n)
     known = (information[:A] > 0.0).astype(float)

@@ -4,30 +4,30 @@ Rows are numbered by the grid: the sample of a row is the nearest one to its sta
 as long as that is held, and a repeated one fills what is missing of it.  Several stamps in a row that are far from
 those before are a gap, or a clock that restarts: the rows that follow are the beginning of a new stretch, which starts
 with an interval of its own.  A single such stamp is an error of the clock, and is left out.
+`SensorWatch` finds sensors that stop, and that return.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import LogError
 
-__all__ = ["Stream"]
+if TYPE_CHECKING:
+    from diransac.identification.tracking.window import Window
+    from diransac.model import Model
+
+__all__ = ["SensorWatch", "Stream"]
 
 # Stamps from which the interval of the grid is measured first.
 _FIRST_STAMPS = 25
-# Stamps in a row that make a jump of the clock; one or two are errors.
-_CONFIRMED = 3
-# Time without a row from which on a new stretch begins, s and rows: as `data.segment.silent_rows`.
-_LONG_SILENCE, _FEWEST_SILENT = 0.25, 8
-# Rows over which the grid is the line of least squares through the stamps, and beyond which it forgets older ones.
-_LINE = 400
-# Rows of one stamp from which on the time does not advance.
-_STANDSTILL = 1000
+# Rows without a stamp from which on a new stretch may begin: as `data.segment.silent_rows`.
+_FEWEST_SILENT = 8
 
 Row = tuple[float, FloatArray]
 
@@ -126,7 +126,7 @@ class Stream:
     def _begun(self, t: float, row: FloatArray) -> list[Row]:
         """The first rows once the grid is known; none before."""
         self._early.append((t, row.copy()))
-        if len(self._early) > _STANDSTILL:
+        if len(self._early) > 1000:
             raise LogError(f"the time of the stream stands still at t = {t:.6g} s; give the time of each sample")
         stamps = np.unique([t for t, _ in self._early])
         if len(stamps) < _FIRST_STAMPS:
@@ -149,7 +149,7 @@ class Stream:
     @property
     def silence(self) -> int:
         """Rows without a stamp from which on a new stretch begins."""
-        return max(_FEWEST_SILENT, round(_LONG_SILENCE / self.dt))
+        return max(_FEWEST_SILENT, round(0.25 / self.dt))
 
     def _take(self, t: float, cells: FloatArray) -> None:
         """Write a row to its place, or suspect its stamp."""
@@ -167,7 +167,8 @@ class Stream:
 
     def _follow(self, row: int, late: float) -> None:
         """Move the grid by a stamp that is late by a part of a row: recursive least squares of a line."""
-        self._n_rows = min(self._n_rows + 1, _LINE)
+        # Beyond 400 rows the line forgets older ones.
+        self._n_rows = min(self._n_rows + 1, 400)
         n = self._n_rows
         change = 6.0 / (n * (n + 1)) * late * self.dt
         self._origin += (4 * n - 2) / (n * (n + 1)) * late * self.dt - change * row
@@ -193,7 +194,8 @@ class Stream:
         if self._suspects and not 0.0 <= t - self._suspects[-1][0] < self.silence * self.dt:
             self._suspects.clear()
         self._suspects.append((t, cells.copy()))
-        if len({stamp for stamp, _ in self._suspects}) == _CONFIRMED:
+        # One or two such stamps in a row are errors of the clock.
+        if len({stamp for stamp, _ in self._suspects}) == 3:
             rows, self._suspects = self._suspects, []
             self._begin_stretch(rows[0][0])
             for stamp, row in rows:
@@ -213,3 +215,47 @@ class Stream:
             self.ended[self.newest - self.first] = True
         self.fresh = self.newest + 1
         self._origin = t - self.fresh * self.dt
+
+
+class SensorWatch:
+    """Findings on sensors and inputs of a stream that stop.
+
+    Parameters
+    ----------
+    model : Model
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.names = (*model.signals, *model.inputs)
+        self.last = np.full(len(self.names), -1)
+        self.count = np.zeros(len(self.names))
+        self.stopped = np.zeros(len(self.names), bool)
+        self.began, self.seen = -1, -1
+
+    def notes(self, stream: Stream, window: Window) -> list[str]:
+        """Findings of the rows since the last call, a sentence each.
+
+        Parameters
+        ----------
+        stream : Stream
+        window : Window
+        """
+        first = max(self.seen, window.first)
+        if first >= window.end:  # a window that has begun anew, with rows that were seen before
+            return []
+        if self.began < 0:
+            self.began = first
+        known = np.isfinite(stream.values[first - stream.first : window.end - stream.first])
+        some = known.any(axis=0)
+        newest = first + len(known) - 1 - np.argmax(known[::-1], axis=0)
+        self.last, self.count = np.where(some, newest, self.last), self.count + known.sum(axis=0)
+        self.seen = window.end
+        usual = (window.end - self.began) / np.maximum(self.count, 1.0)
+        # A sensor that loses samples at random is silent over ten of its usual intervals once in 22,000.
+        silent = window.end - 1 - self.last > np.maximum(stream.silence, 10.0 * usual)
+        stops = np.flatnonzero((self.count > 0) & silent & ~self.stopped)
+        returns = np.flatnonzero(self.stopped & ~silent)
+        self.stopped = (self.count > 0) & silent
+        time = stream.time(window.end - 1)
+        lost = [f"{self.names[k]} is not measured any more, at t = {time:.6g} s" for k in stops]
+        return lost + [f"{self.names[k]} is measured again, at t = {time:.6g} s" for k in returns]

@@ -24,25 +24,19 @@ if TYPE_CHECKING:
 
 __all__ = ["is_surprised", "weights_of_free_motion"]
 
-# Standard deviations of the number of outliers that are a surprise; and the intervals in which they are counted.
-_SURPRISE, _LAST = 4.0, 2
-# Time that the motion is followed, s, and steps until its outliers are found.
-_FOLLOWED, _STEPS = 1.0, 6
-# Part of the samples of a second that are no outliers at least, and what this quantile is of |x|, x standard normal.
-_INLYING, _OF_NORMAL = 0.75, 1.15
 # Standard deviation of parameters that are held, over their values.
 _HELD = 1e-6
 
 
 def is_surprised(window: Window) -> bool:
-    """True if the last intervals of a window have more outliers than chance gives them."""
-    rows = slice(-_LAST * window.length, None)
+    """True if the last two intervals of a window have more outliers than chance gives them: by four deviations."""
+    rows = slice(-2 * window.length, None)
     intervals, fit = window.intervals(), window.fit
     known = intervals.known[rows]
     found = (known - fit.noise.inlying(fit.residuals[rows], known)).sum()
     expected = (known * fit.noise.pi).sum()
     variance = (known * fit.noise.pi * (1.0 - fit.noise.pi)).sum()
-    return bool(found > expected + _SURPRISE * np.sqrt(variance + 1.0))
+    return bool(found > expected + 4.0 * np.sqrt(variance + 1.0))
 
 
 def weights_of_free_motion(window: Window) -> FloatArray:
@@ -56,7 +50,7 @@ def weights_of_free_motion(window: Window) -> FloatArray:
     -------
     (N, n_s) array
     """
-    n = min(len(window), round(_FOLLOWED / (window.length * window.stream.dt)))
+    n = min(len(window), round(1.0 / (window.length * window.stream.dt)))
     whole = window.fit
     rows = slice(-n * window.length, None)
     intervals = window.setup.intervals(window.stream, window.end - n * window.length, n)
@@ -80,9 +74,10 @@ def weights_of_free_motion(window: Window) -> FloatArray:
 def _followed(intervals: ShootingIntervals, fit: Fit) -> Fit:
     """The fit after some steps, with noise as large as the residuals of each at first: none starts as an outlier."""
     usual, damping = fit.noise, 0.0
-    for _ in range(_STEPS):
+    for _ in range(6):
         samples = zip(np.abs(fit.residuals).T, intervals.known.T, strict=True)
-        scale = [np.quantile(x[k], _INLYING) / _OF_NORMAL if k.any() else 0.0 for x, k in samples]
+        # Three quarters of the samples are no outliers; of a standard normal x, this quantile of |x| is 1.15.
+        scale = [np.quantile(x[k], 0.75) / 1.15 if k.any() else 0.0 for x, k in samples]
         fit = replace(fit, noise=replace(usual, sigma=np.maximum(usual.sigma, scale)))
         taken = gauss_newton_step(intervals, fit, linearized(intervals, fit), damping)
         fit, damping = taken.fit, taken.damping

@@ -17,12 +17,9 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
-from diransac.identification.tracking.cold_start import ColdStart
 from diransac.identification.tracking.estimates import TrackedEstimate
-from diransac.identification.tracking.sensors import SensorWatch
-from diransac.identification.tracking.setup import Setup
-from diransac.identification.tracking.starting import Start, begun, smoothed_motion
-from diransac.identification.tracking.stream import Stream
+from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, smoothed_motion
+from diransac.identification.tracking.stream import SensorWatch, Stream
 from diransac.model import Model
 from diransac.process import single_threaded
 
@@ -36,8 +33,6 @@ Samples = Log | Mapping[str, npt.ArrayLike]
 
 # Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother.
 _FIRST = 1.0
-# Windows of rows that are held until there is a start.
-_HELD = 4.0
 
 
 class Tracker:
@@ -99,14 +94,15 @@ class Tracker:
             self._setup, self._start = _started(self._setup, start)
         self._names = (*model.signals, *model.inputs)
         self._steps = max(2, round(window / step))
-        self._step, self._held = step, _HELD * window
+        self._step = step
         # Unmodelled accelerations vary as fast off-line as on-line.
         parts = int(np.ceil(step / self._setup.settings.smoothing_half_width))
-        self._stream = Stream(len(self._names), model.n_u, step, self._held + step, parts)
+        # Four windows of rows are held until there is a start.
+        self._stream = Stream(len(self._names), model.n_u, step, 4.0 * window + step, parts)
         self._cold = ColdStart(self._setup, seed, window, background=background)
         self._new_changes = partial(Changes, self._setup, step, false_alarms_per_hour, drift or {})
         self._changes = self._new_changes()
-        self._sensors = SensorWatch(self._setup)
+        self._sensors = SensorWatch(model)
         self._window: Window | None = None
         self._notes: list[str] = []
         self._retry, self._refused = 0, ""
@@ -190,8 +186,8 @@ class Tracker:
             found = self._cold.sought(stream, end)
             if found is None:
                 return
-            self._setup, self._start = found.setup, found.start
-            self._notes += found.notes
+            self._setup, self._start, note = found
+            self._notes.append(note)
         first = max(stream.first, stream.fresh)
         n = min((end - first) // stream.length, self._steps)
         if n * stream.length * stream.dt < _FIRST - 1e-9 or end < self._retry:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
 from diransac.identification.methods.lo_diransac.refinement import bounded, gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
     SHRINK,
@@ -21,32 +22,21 @@ from diransac.identification.methods.lo_diransac.scales import (
     unbroken_jumps,
 )
 from diransac.identification.tracking.forces import gain_of_freedom
-from diransac.identification.tracking.marginal import marginal
 from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
     from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.tracking.setup import Setup
+    from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stream import Stream
 
-__all__ = ["Linearization", "Window"]
+__all__ = ["AS_LIKELY", "Linearization", "Window"]
 
-# Steps at most with another interval; one that moves no parameter by more than so many standard errors is the last.
-_MOST_STEPS, _SETTLED = 3, 0.1
-# Time over which noise, unmodelled accelerations, and parameters of a model that is not exact are remembered after the
-# window, s: a minute of a sensor at 1 Hz still gives its noise to 10 %.
-_MEMORY = 60.0
-# Unmodelled accelerations of a model that is exact, over the accelerations: as those of `refine_exact`.
-_EXACT = 1e-6
-# Part of the spread of a signal from which on its noise leaves nothing to explain, and of its samples for outliers; as
-# in `search`.
-_ALL_OF_IT = 0.8
-# Evidence, nats, by which unmodelled accelerations must be likelier than none; as in `local_search`.
-_AS_LIKELY = 5.0
-# Standard deviation of a parameter of which nothing is known after a change, over the parameter.
-_FREE = 10.0
+# Steps at most with another interval.
+_MOST_STEPS = 3
+AS_LIKELY = 5.0
+"""Evidence, nats, by which a richer fit must be likelier; as in `local_search`."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +124,9 @@ class Window:
         self.memory = _Memory.empty(fit)
         self._memories = deque([self.memory], maxlen=most)
         self._found, self._gained = np.square(fit.tau), np.inf
-        self.kept = float(np.exp(-self.length * stream.dt / _MEMORY))
+        # Noise, forces, and parameters of a model that is not exact are remembered over a minute after the window: of a
+        # sensor at 1 Hz it still gives the noise to 10 %.
+        self.kept = float(np.exp(-self.length * stream.dt / 60.0))
         self.last: Linearization | None = None
 
     def __len__(self) -> int:
@@ -153,8 +145,8 @@ class Window:
 
     @property
     def least(self) -> FloatArray:
-        """Unmodelled accelerations ``(n_v,)`` of an exact model."""
-        return _EXACT * self.spread
+        """Unmodelled accelerations ``(n_v,)`` of an exact model: as those of `refine_exact`."""
+        return 1e-6 * self.spread
 
     @property
     def expected(self) -> FloatArray:
@@ -191,7 +183,7 @@ class Window:
         """Marginalise the first n intervals; their sums of noise and unmodelled accelerations are remembered."""
         assert self.last is not None
         intervals, now, at = self.last.intervals, self.last.fit, self.last.at
-        boundary = marginal(at, intervals, now, n)
+        boundary = _marginal(at, intervals, now, n)
         rows = n * self.length
         self._remember(intervals, now, n)
         fit = self.fit
@@ -238,7 +230,7 @@ class Window:
         assert fit.boundary is not None
         # The change may be within the interval before or after, whose motion is then that of neither.
         free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
-        free[len(free) - len(shared) + changed] = _FREE * np.maximum(np.abs(shared[changed]), np.abs(sizes))
+        free[len(free) - len(shared) + changed] = 10.0 * np.maximum(np.abs(shared[changed]), np.abs(sizes))
         boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
         self.first, self.times = self.first + rows, self.times[first:]
         # Outliers and forces for which the change was taken until it was found are forgotten.
@@ -265,7 +257,7 @@ class Window:
             at = linearized(intervals, fit)
             taken = gauss_newton_step(intervals, fit, at, damping)
             fit, damping = taken.fit, taken.damping
-        boundary = marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
+        boundary = _marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
         errors = np.sqrt(np.diag(taken.solved.var_p))
         return replace(fit, boundary=boundary), [(float(fit.shared[k]), float(errors[k])) for k in changed]
 
@@ -288,7 +280,7 @@ class Window:
             self.fit = self._with_scales(intervals, taken.fit, solved)
             first = first or self.last
             moved = np.abs(taken.fit.shared - before.shared)
-            if (moved <= _SETTLED * np.sqrt(np.diag(solved.var_p))).all():
+            if (moved <= 0.1 * np.sqrt(np.diag(solved.var_p))).all():
                 break
         assert first is not None
         assert self.last is not None
@@ -312,7 +304,8 @@ class Window:
         """True if noise or unmodelled accelerations are as large as the signals themselves."""
         seen = intervals.known.any(axis=0)
         noise = self.fit.noise
-        nothing = ((noise.sigma > _ALL_OF_IT * self._spread) | (noise.pi > _ALL_OF_IT))[seen].all()
+        # As in `search`.
+        nothing = ((noise.sigma > 0.8 * self._spread) | (noise.pi > 0.8))[seen].all()
         return bool(nothing or (self.fit.tau > self.spread).all())
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
@@ -330,7 +323,7 @@ class Window:
     @property
     def is_exact(self) -> bool:
         """True unless unmodelled accelerations are likelier, in the window and in the last minute before it."""
-        return self.memory.freedom + self._gained < _AS_LIKELY
+        return self.memory.freedom + self._gained < AS_LIKELY
 
     def _usual_size(self) -> FloatArray:
         """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
@@ -363,3 +356,76 @@ class Window:
         series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d, last))
         state = self.setup.model.state
         return dict(zip(state, series[0, -1, : len(state)].tolist(), strict=True))
+
+
+# ---------------------------------------------------------------------- marginalisation
+
+
+def _marginal(at: NormalEquations, intervals: ShootingIntervals, fit: Fit, n: int) -> BoundaryPrior:
+    """Information of the first intervals of a fit, and its boundary, on the unknowns at the start of the next one.
+
+    Parameters
+    ----------
+    at : NormalEquations
+    intervals : ShootingIntervals
+        All with the same parameters.
+    fit : Fit
+        Of these equations.
+    n : int
+        Number of intervals that are marginalised, fewer than there are.
+
+    Returns
+    -------
+    BoundaryPrior
+        At the start of interval ``n``, linearised at the fit.
+    """
+    own = 1.0 / innovation_std(intervals, fit)
+    pull = -own * innovations(intervals, fit)
+    information, right = _beforehand(fit, own[0], pull[0])
+    k, n_x = at.right_z.shape[1], fit.x.shape[1]
+    known, known_right = information, right  # of interval w in its block of the equations
+    for w in range(n):
+        P, F = at.precision[w], at.slopes[w]
+        H, g = np.zeros((2 * k + len(right) - k,) * 2), np.zeros(2 * k + len(right) - k)
+        z, then, s = slice(0, k), slice(k, 2 * k), slice(2 * k, None)
+        H[z, z] = at.system.diagonal[w] + information[:k, :k] - known[:k, :k]
+        H[z, s] = at.system.border[w] + information[:k, k:] - known[:k, k:]
+        H[s, s] = at.corners[w] + information[k:, k:]
+        H[then, z] = at.system.below[w]
+        g[z], g[s] = at.right_z[w] + right[:k] - known_right[:k], at.rights[w] + right[k:]
+        known, known_right = np.zeros_like(information), np.zeros_like(right)
+        known[:n_x, :n_x], known[n_x:k, n_x:k] = np.diag(P), np.diag(np.square(own[w + 1]))
+        known[:n_x, k:] = -P[:, None] * F[:, k:]
+        known_right[:k] = np.concatenate([-P * at.jumps[w], pull[w + 1]])
+        H[then, then], H[then, s], g[then] = known[:k, :k], known[:k, k:], known_right[:k]
+        information, right = _eliminated(H, g, k)
+    point = np.concatenate([fit.x[n], fit.d[n], fit.shared])
+    return BoundaryPrior.of_information(point, information, right)
+
+
+def _beforehand(fit: Fit, own: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information and right-hand side of the first interval's unknowns before its measurements."""
+    if fit.boundary is not None:
+        return fit.boundary.information, fit.boundary.right(fit)
+    n_x = fit.x.shape[1]
+    k = n_x + len(own)
+    information, right = np.zeros((k + len(fit.shared),) * 2), np.zeros(k + len(fit.shared))
+    information[n_x:k, n_x:k], right[n_x:k] = np.diag(np.square(own)), pull
+    return information, right
+
+
+def _eliminated(H: FloatArray, g: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+    """Schur complement of the first k unknowns, and its right side.
+
+    Couplings of these to the next k are below the diagonal, all others above.
+    """
+    n = len(g) - k
+    coupling = np.concatenate([H[k : 2 * k, :k], H[:k, 2 * k :].T])
+    rest = np.triu(H[k:, k:]) + np.triu(H[k:, k:], 1).T
+    own = np.diag(H)[:k]
+    scale = 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0))
+    # A ridge keeps an unknown which nothing determines.
+    scaled = H[:k, :k] * np.outer(scale, scale) + 1e-13 * np.eye(k)
+    solved = np.linalg.solve(scaled, scale[:, None] * np.column_stack([coupling.T, g[:k]]))
+    taken = (coupling * scale) @ solved
+    return rest - taken[:, :n], g[k:] - taken[:, n]

@@ -20,7 +20,7 @@ from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.regression.observers import DrivenStates, Observers
+    from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 
 __all__ = [
@@ -150,9 +150,9 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     return _best(intervals, motion, problem, z[np.isfinite(cost)])
 
 
-def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
+def _driven(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
-    from diransac.identification.regression.observers import DrivenStates
+    from diransac.identification.regression.observers import driven_states
 
     model, hidden = intervals.model, unmeasured_states(intervals)
     bandwidth = 1.0 / (_MEMORY * intervals.duration)
@@ -161,7 +161,7 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     readings = motion.signals[:, first:]
     scale = np.append(bandwidth / motion.spread[len(model.state) :][others], 1.0 / motion.spread[first:])
     used = np.hstack([np.ones((len(readings), len(others)), bool), np.isfinite(readings)])
-    return DrivenStates(
+    return driven_states(
         model,
         intervals.layout,
         hidden,
@@ -176,13 +176,13 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> DrivenStates:
     )
 
 
-def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
+def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     """Observers of all states, in units of the noise of the samples.
 
     Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
     kinematics give.
     """
-    from diransac.identification.regression.observers import Observers
+    from diransac.identification.regression.observers import observers
 
     model, hidden, measured = intervals.model, unmeasured_states(intervals), measured_signals(intervals)
     corrected = {chain[1] for chain in model.chains if chain[0] in measured and len(chain) > 1}
@@ -198,7 +198,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
     scalars = [model.state[four[0]] for four in model.quaternions]
     begin = motion.signals[first][:, [model.signals.index(n) for n in model.state]]
     begin = np.where([n in hidden for n in model.state], [float(n in scalars) for n in model.state], begin)
-    return Observers(
+    return observers(
         model,
         intervals.layout,
         sampled,
@@ -214,9 +214,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> Observers:
     )
 
 
-def _best(
-    intervals: ShootingIntervals, motion: Motion, problem: DrivenStates | Observers, z: FloatArray
-) -> Motion | None:
+def _best(intervals: ShootingIntervals, motion: Motion, problem: ObserverFit, z: FloatArray) -> Motion | None:
     """The motion whose parameters simulate the intervals best, of vectors of unknowns ``(k, n)``."""
     completed, every = [_completed(motion, problem, one) for one in z], np.arange(len(intervals))
     pairs = zip(completed, z[:, : len(intervals.layout)], strict=True)
@@ -224,7 +222,7 @@ def _best(
     return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
 
 
-def _completed(motion: Motion, problem: DrivenStates | Observers, z: FloatArray) -> Motion:
+def _completed(motion: Motion, problem: ObserverFit, z: FloatArray) -> Motion:
     """The motion with the states and their derivatives that unknowns (n,) give."""
     signals, spread = motion.signals.copy(), motion.spread.copy()
     for name, values in problem.trajectories(z).items():
