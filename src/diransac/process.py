@@ -9,13 +9,10 @@ import ctypes
 import os
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 from threadpoolctl import ThreadpoolController
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 __all__ = ["memory_kept", "module_path_safe", "single_threaded"]
 

@@ -29,24 +29,16 @@ __all__ = [
     "check_time_order",
     "describe_gaps",
     "describe_jitter",
+    "is_implausible",
     "numeric_columns",
     "other_spelling",
     "rows_per_sample",
 ]
 
 
-# In mean intervals: the jitter that is not reported, and the one that is an error; in median intervals: a gap.
-_SILENT_JITTER, _TOLERATED_JITTER, _GAP = 1e-3, 0.2, 1.5
 _ROUNDING = 1e-6
-# Common part of two spellings of one name, and what counts as that of an abbreviation, of so many letters; names, and
-# letters of each, that are compared.
-_ALIKE, _ABBREVIATED, _SHORT, _MOST_COMPARED, _LONGEST_NAME = 0.8, 0.9, 3, 1000, 100
-
-# Seconds from row to row: the least that are accepted, likely ones, and the most that are accepted.  Clocks that
-# explain longer ones: their tick in seconds, and the number of ticks from row to row above which it is this clock
-# rather than the next.
-_LEAST, _SHORTEST, _LONGEST, _ABSURD = 1e-12, 1e-7, 1.0, 1e3
-_CLOCKS = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, _LONGEST))
+_SHORTEST_ABBREVIATION, _LONGEST_NAME = 3, 100
+"""Letters of a name that are compared."""
 
 
 # ---------------------------------------------------------------------- columns
@@ -115,31 +107,25 @@ def alike(name: str, others: Iterable[str]) -> str | None:
     >>> alike("theta", ["x", "thteta"]), alike("theta", ["Theta", "teta"]), alike("q1", ["q2"]), alike("x", ["z"])
     ('thteta', 'Theta', None, None)
     """
-    letters, digits = _letters_and_digits(name)
-    found = [(other, *_letters_and_digits(other)) for other in islice(others, _MOST_COMPARED)]
-    rated = [
-        (_ABBREVIATED if _abbreviates(other, name) else _common(letters, own), other)
-        for other, own, n in found
-        if n == digits and own
-    ]
-    near = [pair for pair in rated if pair[0] >= _ALIKE]
-    return max(near, key=lambda pair: pair[0])[1] if near else None
-
-
-def _common(a: str, b: str) -> float:
-    """Common part of two names."""
     from difflib import SequenceMatcher
 
-    return SequenceMatcher(None, a, b).ratio()
+    letters, digits = _letters_and_digits(name)
+    likeness: dict[str, float] = {}
+    for other in islice(others, 1000):
+        own, its_digits = _letters_and_digits(other)
+        if own and its_digits == digits:
+            likeness[other] = 0.9 if _abbreviates(other, name) else SequenceMatcher(None, letters, own).ratio()
+    nearest = max(likeness, key=lambda other: likeness[other], default=name)
+    return nearest if likeness.get(nearest, 0.0) >= 0.8 else None
 
 
 def _abbreviates(short: str, name: str) -> bool:
     """True for ``x_pos`` of ``x_position``, whose words it begins, and for ``arm.force`` of ``force``."""
-    if len(name) >= _SHORT and short.rpartition(".")[2].lower() == name.lower():
+    if len(name) >= _SHORTEST_ABBREVIATION and short.rpartition(".")[2].lower() == name.lower():
         return True
     words, whole = (re.findall(r"[a-z]+|\d+", x[:_LONGEST_NAME].lower()) for x in (short, name))
     begins = len(words) == len(whole) > 0 and all(b.startswith(a) for a, b in zip(words, whole, strict=True))
-    return begins and len(words[-1]) >= _SHORT
+    return begins and len(words[-1]) >= _SHORTEST_ABBREVIATION
 
 
 def other_spelling(name: str, log: Log, model: Model) -> str | None:
@@ -206,7 +192,7 @@ def check_time_order(time: FloatArray, source: str) -> None:
         raise LogError(f"{source}: time is {time[row]} at row {row}; give every row a time in seconds")
     steps = np.diff(time)
     if steps.min() > 0.0:
-        if time[-1] - time[0] < _LEAST * len(steps):
+        if time[-1] - time[0] < 1e-12 * len(steps):
             raise LogError(
                 f"{source}: rows are {float(np.median(steps)):.4g} s apart, which no clock resolves; "
                 "pass --scale t=FACTOR if the time is not in seconds"
@@ -229,16 +215,20 @@ def check_even(time: FloatArray, source: str) -> None:
     """
     steps = np.diff(time)
     dt, usual = float(np.mean(steps)), float(np.median(steps))
-    off = np.abs(steps - dt)
-    if off.max() <= (_TOLERATED_JITTER + _ROUNDING) * dt:
+    if np.abs(steps - dt).max() <= (0.2 + _ROUNDING) * dt:
         return
-    row = int(np.argmax(np.abs(steps - usual)))
-    n_gaps = int((steps > _GAP * usual).sum())
-    what = f"{n_gaps} gap{'s' * (n_gaps > 1)}, the longest" if steps[row] > _GAP * usual else "the most uneven interval"
+    row, gaps = int(np.argmax(np.abs(steps - usual))), steps > 1.5 * usual
+    n_gaps = int(gaps.sum())
+    what = f"{n_gaps} gap{'s' * (n_gaps > 1)}, the longest" if gaps[row] else "the most uneven interval"
     raise LogError(
         f"{source}: time is not uniform: {what} after t = {time[row]:.6g} s (row {row}) is {steps[row]:.4g} s long, "
         f"the usual interval {usual:.4g} s; resample it: --resample {1.0 / usual:.4g}, or read_log(..., resample=...)"
     )
+
+
+def is_implausible(n_new: float, n: int) -> bool:
+    """True for a number of new rows of ``n`` old ones that only a damaged time leads to."""
+    return not n_new <= max(100_000, 1000 * n)
 
 
 def check_clock(time: FloatArray, source: str, *, in_file: bool = False) -> list[str]:
@@ -254,15 +244,17 @@ def check_clock(time: FloatArray, source: str, *, in_file: bool = False) -> list
     Raises LogError: the interval is longer than 1000 s; of a file, than 1 s.
     """
     dt = float(np.median(np.diff(time)))
-    if _SHORTEST <= dt <= _LONGEST * (1.0 + _ROUNDING):
-        return []
     apart = f"rows are {dt:.4g} s apart"
-    if dt < _SHORTEST:
+    if dt < 1e-7:
         return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
-    unit, tick = next((unit, tick) for unit, tick, least in _CLOCKS if dt > least)
+    # The interval from which on these clocks, with their ticks, are more likely than the next.
+    clocks = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, 1.0 + _ROUNDING))
+    unit, tick = next(((unit, tick) for unit, tick, least in clocks if dt > least), ("seconds", 1.0))
+    if unit == "seconds":
+        return []
     finding = f"{apart}: if t is in {unit}, pass --scale t={tick:g}"
-    if dt > _ABSURD or in_file:
-        seconds = "" if dt > _ABSURD else "; if it is in seconds, --scale t=1"
+    if dt > 1e3 or in_file:
+        seconds = "" if dt > 1e3 else "; if it is in seconds, --scale t=1"
         raise LogError(f"{source}: {finding}, or read_log(..., scale={{'t': {tick:g}}}){seconds}")
     return [finding]
 
@@ -271,6 +263,6 @@ def describe_jitter(time: FloatArray) -> list[str]:
     """Sentence about the largest deviation from an even clock, if it exceeds 0.1 % of a sample."""
     steps = np.diff(time)
     jitter = np.abs(steps / steps.mean() - 1.0)
-    if jitter.max() <= _SILENT_JITTER:
+    if jitter.max() <= 1e-3:
         return []
     return [f"time is uneven by up to {jitter.max():.1%} of a sample (at t = {time[int(jitter.argmax())]:.6g} s)"]

@@ -8,8 +8,9 @@ invented or moved to another value.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,26 +18,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import checks
 from diransac.errors import LogError
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
 __all__ = ["Gridded", "in_order", "is_even", "on_own_grid", "runs_freely"]
-
-_OFF_GRID, _LATE = 0.4, 0.1
-"""Distance of a stamp from its sample that is no jitter, and one by which a late stamp misses the next, in samples.
-
-Jitter may be a third; the phase of the grid is uncertain by the rest.
-"""
-_MOST_OFF, _MOST_REPEATED, _MOST_GAPS = 0.02, 0.01, 0.25
-"""Shares of the rows, at most: off the grid, without a sample of their own, before a gap."""
-_SHORT, _LONG, _MOSTLY = 0.5, 2.5, 0.95
-"""Intervals of a loop without a grid, in median ones, and their share."""
-_WINDOW, _FURTHEST_BACK = 25, 3.5
-"""Rows over which the phase is averaged; samples by which time may run backwards."""
-_PART, _LONGEST = 4, 1000
-"""Rows over which the interval is measured: this part of them, and at most so many."""
-_MOST_NEW, _MANY_ROWS = 1000, 100_000
-"""New rows per old one, of more than so many, that only a damaged time takes."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +60,14 @@ def in_order(time: FloatArray, source: str) -> IntArray:
     rows = np.argsort(time, kind="stable")
     rows = rows[np.r_[True, np.diff(time[rows]) > 0.0]]
     usual = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 0.0
-    if len(rows) < 2 or steps.min() < -_FURTHEST_BACK * usual or n - len(rows) > max(1.0, _MOST_REPEATED * n):
+    if len(rows) < 2 or steps.min() < -3.5 * usual or _are_many(n - len(rows), n):
         checks.check_time_order(time, source)
     return rows
+
+
+def _are_many(n_repeated: int, n: int) -> bool:
+    """True where more than a few of ``n`` rows have no sample of their own."""
+    return n_repeated > max(1.0, 0.01 * n)
 
 
 def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Gridded:
@@ -104,15 +91,16 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     dt = float(np.median(np.diff(time[rows])))
     with np.errstate(over="ignore"):
         n_new = float(time[rows[-1]] - time[rows[0]]) / dt
-    if not n_new < max(_MANY_ROWS, _MOST_NEW * len(time)):
+    if checks.is_implausible(n_new, len(time)):
         checks.check_even(time[rows], source)
     dt = _interval(time[rows], _places(time[rows], dt)[0])
     places, off = _places(time[rows], dt)
     kept = _kept(places, off)
     n, n_gaps = int(places[kept].max()) + 1, int((np.diff(places[kept]) > 1).sum())
     n_repeated = len(time) - int(kept.sum())
-    is_grid = (np.abs(off) > _OFF_GRID).mean() <= _MOST_OFF and n_gaps <= _MOST_GAPS * len(rows)
-    if not is_grid or n_repeated > max(1.0, _MOST_REPEATED * len(time)):
+    # Jitter may be a third of a sample; the phase of the grid is uncertain by the rest.
+    is_grid = (np.abs(off) > 0.4).mean() <= 0.02 and n_gaps <= 0.25 * len(rows)
+    if not is_grid or _are_many(n_repeated, len(time)):
         checks.check_even(time[rows], source)
         raise LogError(f"{source}: {n_repeated} of {len(time)} rows repeat a time; remove them")
     rows, at = rows[kept], places[kept]
@@ -125,7 +113,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
         on_grid[name][at] = values[rows]
     step = {"step": "grid", "rate": 1.0 / dt, "rows": [len(time), n], "missing": int((~recorded).sum())}
     step |= {"repeated": n_repeated, "swapped": int((np.diff(time) < 0.0).sum())}
-    said = _sentence(step, time[rows], at, float(np.quantile(np.abs(off), _MOSTLY)))
+    said = _sentence(step, time[rows], at, float(np.quantile(np.abs(off), 0.95)))
     return Gridded(grid, on_grid, recorded, step, (said,))
 
 
@@ -142,7 +130,7 @@ def is_even(time: FloatArray) -> bool:
 def runs_freely(time: FloatArray) -> bool:
     """True for increasing stamps ``(N,)`` of a loop without a grid, nearly all of whose intervals are about as long."""
     steps = np.diff(time) / np.median(np.diff(time))
-    return bool(((steps >= _SHORT) & (steps <= _LONG)).mean() >= _MOSTLY)
+    return bool(((steps >= 0.5) & (steps <= 2.5)).mean() >= 0.95)
 
 
 def _places(time: FloatArray, dt: float) -> tuple[IntArray, FloatArray]:
@@ -150,7 +138,7 @@ def _places(time: FloatArray, dt: float) -> tuple[IntArray, FloatArray]:
     at = (time - time[0]) / dt
     sums = np.concatenate([[0.0], np.cumsum(np.exp(2j * np.pi * at))])
     rows = np.arange(len(at))
-    mean = sums[np.minimum(rows + _WINDOW // 2 + 1, len(at))] - sums[np.maximum(rows - _WINDOW // 2, 0)]
+    mean = sums[np.minimum(rows + 13, len(at))] - sums[np.maximum(rows - 12, 0)]  # of 25 rows
     relative = at - np.unwrap(np.angle(mean)) / (2.0 * np.pi)
     places = np.round(relative)
     return (places - places[0]).astype(np.int64), relative - places
@@ -158,7 +146,7 @@ def _places(time: FloatArray, dt: float) -> tuple[IntArray, FloatArray]:
 
 def _interval(time: FloatArray, places: IntArray) -> float:
     """Median interval from sample to sample over many of them, which single hiccups do not change."""
-    ahead = max(1, min(len(time) // _PART, _LONGEST))
+    ahead = max(1, min(len(time) // 4, 1000))
     passed = np.maximum(places[ahead:] - places[:-ahead], 1)
     return float(np.median((time[ahead:] - time[:-ahead]) / passed))
 
@@ -168,7 +156,7 @@ def _kept(places: IntArray, off: FloatArray) -> BoolArray:
 
     A late stamp, which comes before that of its sample, is first moved to the free sample before: places change.
     """
-    for i in np.flatnonzero((np.diff(places) == 0) & (off[:-1] < -_LATE)).tolist():
+    for i in np.flatnonzero((np.diff(places) == 0) & (off[:-1] < -0.1)).tolist():
         if i == 0 or places[i - 1] < places[i] - 1:
             places[i] -= 1
     places -= places.min()
@@ -182,7 +170,7 @@ def _sentence(step: Mapping[str, Any], time: FloatArray, places: IntArray, jitte
     """A sentence on what was odd about a clock."""
     apart = np.diff(places)
     row, n_gaps = int(np.argmax(apart)), int((apart > 1).sum())
-    parts = [f"{_MOSTLY:.0%} of the stamps are within {jitter:.0%} of a sample"] if jitter >= 0.01 else []
+    parts = [f"95% of the stamps are within {jitter:.0%} of a sample"] if jitter >= 0.01 else []
     if n_gaps:
         longest = f"the longest {time[row + 1] - time[row]:.4g} s after t = {time[row]:.6g} s"
         missing = f"{step['missing']} row{'s are' if step['missing'] > 1 else ' is'} missing"

@@ -20,8 +20,10 @@ from __future__ import annotations
 import gzip
 import io
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +31,6 @@ from diransac.arrays import FloatArray
 from diransac.atomic import draft
 from diransac.data.filters import FilterSpecification
 from diransac.errors import LogError, SettingsError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
 __all__ = [
     "COMMENT",
@@ -49,9 +47,7 @@ __all__ = [
 
 KEY, MEMBER, COMMENT = "diransac", "diransac.json", "# diransac:"
 """Place of the metadata in a Parquet file, in an NPZ archive and, of earlier versions, in CSV text."""
-_CSV_ON_THE_WEB, _UNIT = "http://www.w3.org/ns/csvw", "schema:unitText"
-
-_VERSION = 1
+_VERSION, _UNIT = 1, "schema:unitText"
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ def _csv_on_the_web(table: Path, columns: Sequence[str], metadata: str) -> str:
         {"titles": name, "datatype": "number", **({_UNIT: units[name]} if name in units else {})} for name in columns
     ]
     content = {
-        "@context": _CSV_ON_THE_WEB,
+        "@context": "http://www.w3.org/ns/csvw",
         "url": table.name,
         "tableSchema": {"columns": described},
         "notes": [{KEY: facts}],

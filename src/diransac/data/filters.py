@@ -8,17 +8,15 @@ shifts no phase; as it is finite, a filtered sample depends on what lies within 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 __all__ = ["REACH", "FilterSpecification", "convolve", "half_length", "kernels", "median_filter"]
 

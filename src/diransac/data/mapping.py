@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,22 +14,9 @@ from diransac.arrays import FloatArray
 from diransac.errors import LogError
 from diransac.text_table import some
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
 __all__ = ["ATTITUDES", "AXES", "Condition", "Event", "LogMapping", "MappedSignals", "held"]
 
 TextArray = np.ndarray[Any, np.dtype[np.object_]]
-
-_HALF = math.sqrt(0.5)
-AXES: dict[str, FloatArray] = {
-    **dict.fromkeys(("ned-to-enu", "enu-to-ned"), np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])),
-    **dict.fromkeys(("frd-to-flu", "flu-to-frd"), np.diag([1.0, -1.0, -1.0])),
-}
-"""Matrices of the changes of frame of a vector."""
-ATTITUDES = ("ned-frd-to-enu-flu", "enu-flu-to-ned-frd")
-
-_ANY = "{joint}"
 
 
 @dataclass(frozen=True)
@@ -55,6 +43,35 @@ class Condition:
         return " and ".join([*limits, *([f"below {self.below:g}"] if self.below < math.inf else [])])
 
 
+def _between_ned_and_enu(v: Sequence[FloatArray]) -> list[FloatArray]:
+    x, y, z = v
+    return [y, x, -z]
+
+
+def _between_frd_and_flu(v: Sequence[FloatArray]) -> list[FloatArray]:
+    x, y, z = v
+    return [x, -y, -z]
+
+
+def _other_attitude(q: Sequence[FloatArray]) -> list[FloatArray]:
+    """Attitude ``r o q o s`` of a body with axes FLU in ENU, from that of FRD in NED, or the reverse.
+
+    ``r`` turns NED into ENU, half a turn about north-east, and ``s`` half a turn about the body's x axis.
+    """
+    w, x, y, z = q
+    half = math.sqrt(0.5)
+    return [half * (w + z), half * (x + y), half * (x - y), half * (w - z)]
+
+
+AXES = {
+    **dict.fromkeys(("ned-to-enu", "enu-to-ned"), _between_ned_and_enu),
+    **dict.fromkeys(("frd-to-flu", "flu-to-frd"), _between_frd_and_flu),
+}
+"""Changes of frame of a vector."""
+ATTITUDES = dict.fromkeys(("ned-frd-to-enu-flu", "enu-flu-to-ned-frd"), _other_attitude)
+"""Changes of frame of a quaternion."""
+
+
 @dataclass(frozen=True)
 class MappedSignals:
     """One signal, or the components of one vector or quaternion, and their source.
@@ -71,7 +88,7 @@ class MappedSignals:
     factors, offsets : tuple of float
         ``value = factor * field + offset``, before the change of frame.
     frame : str, optional
-        Change of frame, a key of `AXES` or one of `ATTITUDES`.
+        Change of frame, a key of `AXES` or of `ATTITUDES`.
     optional : bool
         True if a log may lack the topic or the field.
     where : tuple of Condition
@@ -99,10 +116,8 @@ class MappedSignals:
         if self.factors or self.offsets:
             factors, offsets = self.factors or (1.0,) * len(rows), self.offsets or (0.0,) * len(rows)
             rows = [x if f == 1.0 and b == 0.0 else f * x + b for x, f, b in zip(rows, factors, offsets, strict=True)]
-        if self.frame in AXES:
-            rows = _signed_permutation(AXES[self.frame], rows)
-        elif self.frame is not None:
-            rows = _other_attitude(rows)
+        if self.frame is not None:
+            rows = {**AXES, **ATTITUDES}[self.frame](rows)
         if self.where:
             valid = np.logical_and.reduce([x.holds(columns[x.field]) for x in self.where])
             rows = [np.where(valid, x, np.nan) for x in rows]
@@ -155,21 +170,6 @@ def held(time: FloatArray, flags: FloatArray, rows: FloatArray) -> FloatArray:
     order = np.argsort(time, kind="stable")
     last = np.searchsorted(time[order], rows, side="right") - 1
     return np.asarray(np.where(last < 0, np.nan, flags[order][np.maximum(last, 0)]))
-
-
-def _signed_permutation(matrix: FloatArray, rows: Sequence[FloatArray]) -> list[FloatArray]:
-    """Rows under a matrix of which each row has one entry, 1 or -1; their numbers keep their bits."""
-    sources = np.abs(matrix).argmax(axis=1)
-    return [rows[j] if matrix[i, j] > 0.0 else -rows[j] for i, j in enumerate(sources)]
-
-
-def _other_attitude(q: Sequence[FloatArray]) -> list[FloatArray]:
-    """Attitude ``r o q o s`` of a body with axes FLU in ENU, from that of FRD in NED, or the reverse.
-
-    ``r`` turns NED into ENU, half a turn about north-east, and ``s`` half a turn about the body's x axis.
-    """
-    w, x, y, z = q
-    return [_HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)]
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,8 @@ class LogMapping:
         if not found:
             what, there = ("columns", fields[""]) if set(fields) == {""} else ("topics", list(fields))
             raise LogError(f"{source}: {self.source} fits none of its {what}; found {some(there)}")
-        notes = [f"{self.source}: no {', '.join(n for n in absent if absent[n] == w)}: {w}" for w in _unique(absent)]
+        reasons = dict.fromkeys(absent.values())
+        notes = [f"{self.source}: no {', '.join(n for n in absent if absent[n] == why)}: {why}" for why in reasons]
         entries = list(dict.fromkeys(found.values()))
         for entry in entries:
             other = next((name for name in entry.names if found[name] != entry), None)
@@ -268,22 +269,15 @@ class LogMapping:
         return entries, notes
 
 
-def _unique(absent: Mapping[str, str]) -> list[str]:
-    return list(dict.fromkeys(absent.values()))
-
-
 def _of_elements(entry: MappedSignals, elements: Sequence[str] | None) -> list[MappedSignals]:
     """The entry, once for each element where it has the placeholder ``{joint}`` and the topic has elements."""
-    if not elements or not any(_ANY in text for text in (*entry.names, *entry.fields)):
+    if not elements or not any("{joint}" in text for text in (*entry.names, *entry.fields)):
         return [entry]
-    return [
-        replace(
-            entry,
-            names=tuple(x.replace(_ANY, element) for x in entry.names),
-            fields=tuple(x.replace(_ANY, element) for x in entry.fields),
-        )
-        for element in elements
-    ]
+
+    def of(element: str, texts: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(x.replace("{joint}", element) for x in texts)
+
+    return [replace(entry, names=of(x, entry.names), fields=of(x, entry.fields)) for x in elements]
 
 
 def _why_not(

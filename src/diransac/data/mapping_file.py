@@ -47,9 +47,6 @@ BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu
 """Names of the mappings that come with the package."""
 
 
-_STEPS = {"resample", "repair", "from", "until", "while", "despike", "shift", "differentiate", "bandwidth"}
-
-
 # Forms ----------------------------------------------------------------------------------------------------------------
 def _or_list(kind: Any) -> Callable[[Any], Any]:
     """Validator that makes a list of a single value."""
@@ -173,10 +170,18 @@ def load_mapping(mapping: str | Path) -> LogMapping:
     if isinstance(mapping, str) and mapping in BUILT_IN:
         source = f'mapping "{mapping}"'
         text = (Path(__file__).parent / "mappings" / f"{mapping}.toml").read_text(encoding="utf-8")
-    else:
-        path = Path(mapping)
-        source = f'mapping "{path}"'
-        text = _text(path, source)
+        return parse_mapping(text, source)
+    path = Path(mapping)
+    source = f'mapping "{path}"'
+    try:
+        text = read_text(path, LARGEST_TABLE)
+    except FileNotFoundError as error:
+        built_in = ", ".join(BUILT_IN)
+        raise LogError(f"{source}: there is no such file; built in are {built_in}") from error
+    except OSError as error:
+        raise LogError(f"{source}: it cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise LogError(f"{source}: {error}") from error
     return parse_mapping(text, source)
 
 
@@ -186,37 +191,23 @@ def parse_mapping(text: str, source: str) -> LogMapping:
         content = toml_table(text)
     except ValueError as error:
         raise LogError(f"{source}: it is not TOML ({' '.join(str(error).split()):.120})") from error
-    return replace(_parse(content, source), text=text)
-
-
-def _text(path: Path, source: str) -> str:
-    try:
-        return read_text(path, LARGEST_TABLE)
-    except FileNotFoundError as error:
-        built_in = ", ".join(BUILT_IN)
-        raise LogError(f"{source}: there is no such file; built in are {built_in}") from error
-    except OSError as error:
-        raise LogError(f"{source}: it cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise LogError(f"{source}: {error}") from error
-
-
-def _parse(content: Mapping[str, Any], source: str) -> LogMapping:
     form = _Mapping.read(content, source)
     if not form.signals:
         raise LogError(f"{source}: it maps no signal; write [[signals]] with name, topic and field")
-    column = _Time.read(form.time, f"{source}: time") if isinstance(form.time, dict) else None
-    if column is not None and column.scale == 0.0:
-        raise LogError(f"{source}: time: scale is 0; give a factor other than 0")
-    return LogMapping(
+    steps = {"resample", "repair", "from", "until", "while", "despike", "shift", "differentiate", "bandwidth"}
+    loaded = LogMapping(
         source,
         tuple(_signals(x, f"{source}: signal {k + 1}") for k, x in enumerate(form.signals)),
         tuple(_event(x, f"{source}: events") for x in form.events),
-        form.time if isinstance(form.time, str) else "header",
-        None if column is None else column.column,
-        1.0 if column is None else column.scale,
-        {name: content[name] for name in sorted(_STEPS & content.keys())},
+        preparation={name: content[name] for name in sorted(steps & content.keys())},
+        text=text,
     )
+    if isinstance(form.time, str):
+        return replace(loaded, time=form.time)
+    column = _Time.read(form.time, f"{source}: time")
+    if column.scale == 0.0:
+        raise LogError(f"{source}: time: scale is 0; give a factor other than 0")
+    return replace(loaded, time_column=column.column, time_scale=column.scale)
 
 
 def _signals(table: Mapping[str, Any], source: str) -> MappedSignals:

@@ -22,13 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["Segment", "bind_log", "spelling_notes"]
 
 
-# A line through seven samples bears two outliers, and is short against any motion that is sampled well; the slope that
-# stands for a missing velocity needs a longer one.
-_ROWS_FOR_VALUE, _ROWS_FOR_SLOPE = 7, 25
-# Rows that an input is held for, beyond which the motion is no longer the one that it made.
 _LONG_HOLD = 3
-# Time, rows, and usual intervals between samples, without a sample of any signal: then the motion is found anew.
-_LONG_SILENCE, _FEWEST_SILENT, _SILENT_INTERVALS = 0.25, 8, 4
+"""Rows that an input is held for, beyond which the motion is no longer the one that it made."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +72,8 @@ class Segment:
     @cached_property
     def stretches(self) -> tuple[slice, ...]:
         """Rows from each gap to the next, from the first one that counts; the whole log where there is no gap."""
-        parts = [
-            slice(x.start + int(np.argmax(self.valid[x])), x.stop) for x in runs(~self.gaps) if self.valid[x].any()
-        ]
-        return tuple(parts)
+        parts = (x for x in runs(~self.gaps) if self.valid[x].any())
+        return tuple(slice(x.start + int(np.argmax(self.valid[x])), x.stop) for x in parts)
 
     def part(self, rows: slice) -> Segment:
         """The segment of some of the rows alone; the segment itself if these are all."""
@@ -161,7 +154,7 @@ class Segment:
     def _start_of_missing(self, name: str, rule: str | Mapping[str, float]) -> float:
         coordinate = name.removesuffix("_dot")
         if rule == "robust" and self.model.kinematics is None and coordinate in self.present:
-            return self._line(coordinate, _ROWS_FOR_SLOPE)[1]
+            return self._line(coordinate, 25)[1]
         raise LogError(
             f'{self.log.source}: a simulation needs the initial value of "{name}", which the log lacks; give '
             f"initial_state = {{{name} = ...}}"
@@ -172,10 +165,13 @@ class Segment:
         return float(column[np.flatnonzero(np.isfinite(column))[0]])
 
     def _robust(self, name: str) -> float:
-        """The first sample, unless it is far from the line through the first few: then the line's value at row 0."""
+        """The first sample, unless it is far from the line through the first few: then the line's value at row 0.
+
+        A line through seven samples bears two outliers, and is short against any motion that is sampled well.
+        """
         column = self.column(name)
-        rows = np.flatnonzero(np.isfinite(column))[:_ROWS_FOR_VALUE]
-        value, slope = self._line(name, _ROWS_FOR_VALUE)
+        rows = np.flatnonzero(np.isfinite(column))[:7]
+        value, slope = self._line(name, 7)
         distances = np.abs(column[rows] - value - slope * rows * self.log.dt)
         return float(column[rows[0]]) if distances[0] <= 5.0 * np.median(distances) else value
 
@@ -338,7 +334,7 @@ def silent_rows(known: BoolArray, dt: float) -> BoolArray:
     """
     some: BoolArray = np.asarray(known.any(axis=1))
     usual = np.median(np.diff(np.flatnonzero(some))) if some.sum() > 1 else 1.0
-    return long_runs(~some, max(_FEWEST_SILENT, round(_LONG_SILENCE / dt), round(_SILENT_INTERVALS * usual)))
+    return long_runs(~some, max(8, round(0.25 / dt), round(4 * usual)))
 
 
 def _raise_missing(model: Model, log: Log, name: str) -> None:
@@ -405,10 +401,9 @@ def _unmeasured_notes(model: Model, log: Log, signals: Sequence[str]) -> list[st
     """A note on coordinates that act on what is measured, and that the log lacks; none where it has all."""
     absent = [n for n in model.coordinates if n not in log]
     acting = absent and set(model.states_behind(signals))
-    found = ", ".join(("t", *log.names))
     hidden = [f'"{n}"' for n in absent if n in acting]
     are = "is not in the log, and counts" if len(hidden) == 1 else "are not in the log, and count"
-    return [f"{', '.join(hidden)} {are} as unmeasured; found {found}"] if hidden else []
+    return [f"{', '.join(hidden)} {are} as unmeasured; found {', '.join(('t', *log.names))}"] if hidden else []
 
 
 def _row_notes(valid: BoolArray, held: BoolArray, lost: BoolArray, sampled: BoolArray) -> list[str]:

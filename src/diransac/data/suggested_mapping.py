@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from diransac.data.mapping import LogMapping, MappedSignals
+from diransac.data.mapping import Condition, MappedSignals
 from diransac.data.mapping_file import BUILT_IN, load_mapping
 from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Coverage", "suggest_mapping"]
 
-_LEAST, _LISTED = 0.5, 3
 _STATES = frozenset(
     {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
 )
@@ -112,7 +113,7 @@ class Coverage:
         parts += self._event()
         if self.missing:
             rest = {topic: shortened(labels) for topic, labels in self.unused.items()}
-            others = (f"Other fields{_of(t)}: {some(labels, 60)}" for t, labels in rest.items() if labels)
+            others = (f"Other fields{f' of {t}' * bool(t)}: {some(x, 60)}" for t, x in rest.items() if x)
             parts.append("".join(f"# {comment(line)}\n" for line in others))
         return "\n".join(part for part in parts if part)
 
@@ -128,10 +129,6 @@ class Coverage:
                         f"# where = {{ field = {literal(label)}, equals = 1 }}\n"
                     ]
         return []
-
-
-def _of(topic: str) -> str:
-    return f" of {topic}" if topic else ""
 
 
 def suggest_mapping(
@@ -164,7 +161,7 @@ def suggest_mapping(
         if name in entries:
             continue
         near = _nearest(name, fields)
-        if near and near[0][0] >= _LEAST and not _is_taken(near[0][1], entries):
+        if near and near[0][0] >= 0.5 and near[0][1] not in _used(entries):
             entries[name] = _entry(name, *near[0][1], model.units.get(name, "?"))
     derivable, missing = dict[str, str](), dict[str, tuple[str, ...]]()
     for name in needed:
@@ -174,10 +171,10 @@ def suggest_mapping(
         if parent is not None and (parent in entries or parent in derivable or parent in missing):
             derivable[name] = parent
         elif name not in model.accelerations:
-            near = [x for x in _nearest(name, fields) if x[0] > 0.0][:_LISTED]
+            near = [x for x in _nearest(name, fields) if x[0] > 0.0][:3]
             missing[name] = tuple(f"{topic}.{label}" if topic else label for _, (topic, label) in near)
     ordered = {name: entries[name] for name in needed if name in entries}
-    used = {(entry.topic, label) for entry in ordered.values() for label in entry.fields}
+    used = _used(ordered)
     unused = {topic: tuple(label for label in labels if (topic, label) not in used) for topic, labels in fields.items()}
     return Coverage(model.name, source, ordered, derivable, missing, model.units, built_in, _clock(fields), unused)
 
@@ -208,23 +205,11 @@ def _built_in(
     """The built-in mapping that serves most signals, and its entries; neither where it serves less than half."""
     best: tuple[str | None, dict[str, MappedSignals]] = (None, {})
     for name in BUILT_IN:
-        served = _served(load_mapping(name), fields, elements, needed)
-        if len(served) > len(best[1]):
-            best = name, served
+        with suppress(LogError):
+            entries, _ = load_mapping(name).chosen(fields, elements, "log")
+            served = {name: entry for entry in entries for name in entry.names if name in needed}
+            best = (name, served) if len(served) > len(best[1]) else best
     return best if 2 * len(best[1]) >= len(needed) else (None, {})
-
-
-def _served(
-    mapping: LogMapping,
-    fields: Mapping[str, Sequence[str]],
-    elements: Mapping[str, Sequence[str]],
-    needed: Sequence[str],
-) -> dict[str, MappedSignals]:
-    try:
-        entries, _ = mapping.chosen(fields, elements, "log")
-    except LogError:
-        return {}
-    return {name: entry for entry in entries for name in entry.names if name in needed}
 
 
 def _entry(name: str, topic: str, label: str, unit: str) -> MappedSignals:
@@ -235,8 +220,9 @@ def _entry(name: str, topic: str, label: str, unit: str) -> MappedSignals:
     return MappedSignals((name,), (label,), topic, (unit,), (factor,))
 
 
-def _is_taken(place: tuple[str, str], entries: Mapping[str, MappedSignals]) -> bool:
-    return any(place == (entry.topic, label) for entry in entries.values() for label in entry.fields)
+def _used(entries: Mapping[str, MappedSignals]) -> set[tuple[str, str]]:
+    """Topic and field of each source of some entries."""
+    return {(entry.topic, label) for entry in entries.values() for label in entry.fields}
 
 
 def _nearest(name: str, fields: Mapping[str, Sequence[str]]) -> list[tuple[float, tuple[str, str]]]:
@@ -274,6 +260,12 @@ def _value(value: object) -> str:
     return literal(value) if isinstance(value, str) else repr(value)
 
 
+def _toml_of_condition(condition: Condition) -> str:
+    """A condition as TOML, without the limits that it does not have."""
+    known = {key: x for key, x in vars(condition).items() if x not in (None, math.inf, -math.inf)}
+    return "{ " + ", ".join(f"{key} = {_value(x)}" for key, x in known.items()) + " }"
+
+
 def _toml(entry: MappedSignals, units: Mapping[str, str]) -> str:
     """One entry as TOML."""
     several = len(entry.names) > 1
@@ -288,12 +280,7 @@ def _toml(entry: MappedSignals, units: Mapping[str, str]) -> str:
         lines += ['order = "wxyz"'] if len(entry.names) == 4 else []
         lines.append(f"frame = {literal(entry.frame)}")
     if entry.where:
-        limits = [
-            {"field": x.field, **{k: v for k, v in (("above", x.above), ("below", x.below)) if abs(v) != float("inf")}}
-            for x in entry.where
-        ]
-        inner = ", ".join("{ " + ", ".join(f"{k} = {_value(v)}" for k, v in x.items()) + " }" for x in limits)
-        lines.append(f"where = [{inner}]")
+        lines.append(f"where = [{', '.join(map(_toml_of_condition, entry.where))}]")
     known = entry.known_units()
     if known:
         lines.append(f"unit = {literal(next(iter(known.values())))}")

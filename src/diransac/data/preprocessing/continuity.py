@@ -31,20 +31,15 @@ if TYPE_CHECKING:
 __all__ = ["continuous", "continuous_quaternions", "interpolated", "unit_quaternions", "unwrap", "whole_quaternions"]
 
 
-# Samples to either side of the one whose medoid is sought, at most; samples of the running medians.
-_REACH, _REACH_OF_ATTITUDES, _WINDOW, _PERSISTS = 5, 3, 25, 5
-# In turns: departures from the medoid that are always or never those of a good sample; deviation of a leap from one
-# turn beside the motion; the margin by which good samples leave the turn to which an angle is wrapped.
-_CLOSE, _FAR, _NEARLY, _MARGIN = 0.05, 0.25, 0.1, 0.02
+_WINDOW, _PERSISTS = 25, 5
+"""Samples of the running medians."""
+_CLOSE, _FAR = 0.05, 0.25
+"""Departures from the medoid, in turns, that are always or never those of a good sample."""
+_MARGIN, _MUCH_MOTION = 0.02, 3.0
+"""Turns by which good samples leave the turn to which an angle is wrapped; usual steps that count as motion."""
 _USUAL_MIDDLES = (0.0, 0.5)
-# Fraction of the good samples that lie within that turn, at least.
-_MANY_SIGMA, _MUCH_MOTION = 8.0, 3.0
-# Difference of two components that counts at most, and the weight of uncapped components, which breaks ties.
-_CAP, _TIE = 1.0, 1e-9
-# Relative deviations of a quaternion's norm that are its own, and those that are rounding errors.
-_OWN_NORM, _ROUNDING = 0.1, 1e-9
-# Turns of angles whose unit is unknown; fraction of unit norms of a quaternion; distance from a row, in rows.
-_TURNS, _MOSTLY, _AT_A_ROW = (2.0 * math.pi, 360.0), 0.8, 1e-6
+_OWN_NORM = 0.1
+"""Relative deviation of a quaternion's norm that is its own."""
 
 
 def continuous(log: Log, model: Model) -> Log:
@@ -96,7 +91,7 @@ def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: Floa
     found = {}
     with np.errstate(over="ignore", invalid="ignore"):  # of samples that are damaged
         for name, values in signals.items():
-            turns = sum((turn * _revolutions(values, turn) for turn in _TURNS), np.zeros(len(values)))
+            turns = sum((turn * _revolutions(values, turn) for turn in (2.0 * math.pi, 360.0)), np.zeros(len(values)))
             found[name] = _between(values + turns, left, weight) - turns[nearest]
         for names in _quaternions_of(signals):
             q = np.column_stack([signals[name] for name in names])
@@ -109,7 +104,7 @@ def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: Floa
 def _between(values: FloatArray, left: IntArray, weight: FloatArray) -> FloatArray:
     """Linear interpolation without neighbours of zero weight."""
     mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
-    return np.where(weight < _AT_A_ROW, values[left], np.where(weight > 1.0 - _AT_A_ROW, values[left + 1], mixed))
+    return np.where(weight < 1e-6, values[left], np.where(weight > 1.0 - 1e-6, values[left + 1], mixed))
 
 
 def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:
@@ -118,7 +113,7 @@ def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:
     while len(names) >= 4:
         norms = np.linalg.norm([signals[name] for name in names[:4]], axis=0)
         known = np.isfinite(norms)
-        is_one = known.any() and (np.abs(norms[known] - 1.0) <= _OWN_NORM).mean() >= _MOSTLY
+        is_one = known.any() and (np.abs(norms[known] - 1.0) <= _OWN_NORM).mean() >= 0.8
         found += [names[:4]] if is_one else []
         names = names[4 if is_one else 1 :]
     return found
@@ -202,12 +197,12 @@ def _is_continuous_beside_outliers(y: FloatArray) -> bool:
 
 def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
     """Samples ``(N,)`` of an angle, in turns, that are close on the circle to a medoid with which most others agree."""
-    reach = int(np.clip(_FAR / max(float(np.quantile(motion, 0.9)), _CLOSE), 1, _REACH))
+    reach = int(np.clip(_FAR / max(float(np.quantile(motion, 0.9)), _CLOSE), 1, 5))
     around = _neighbours(len(y), reach)
     usual = y[_medoids(y[:, None], lambda a, b: np.abs(_remainder(a - b)[:, 0]), around)]
     off = np.abs(_remainder(usual - y))
     # 1.4826: standard deviation from the median absolute one.
-    close = off <= np.clip(_MANY_SIGMA * 1.4826 * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
+    close = off <= np.clip(8.0 * 1.4826 * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
     agreement = np.abs(_remainder(y[around] - usual[:, None])) <= np.minimum(_CLOSE + reach * motion, _FAR)[:, None]
     return np.asarray(close & (agreement.mean(axis=1) >= 0.5))
 
@@ -237,7 +232,7 @@ def _middle_of_leaps(y: FloatArray, motion: FloatArray) -> float:
     0 and half a turn are usual, and found from one leap.  Of several, it is that of the turn with the most samples.
     """
     leaps = np.abs(np.diff(y))
-    is_wrap = np.abs(leaps - 1.0) <= np.minimum(_NEARLY + _MUCH_MOTION * motion[1:], _FAR)
+    is_wrap = np.abs(leaps - 1.0) <= np.minimum(0.1 + _MUCH_MOTION * motion[1:], _FAR)
     if not is_wrap.any():
         return np.nan
     middles = (0.5 * (y[1:] + y[:-1]))[is_wrap]
@@ -294,7 +289,7 @@ def continuous_quaternions(q: FloatArray) -> FloatArray:
     usual_norm = float(np.median(norms)) if len(whole) else 0.0
     if not usual_norm > 0.0:
         return q
-    scaled, around = q / usual_norm, _neighbours(len(whole), _REACH_OF_ATTITUDES)
+    scaled, around = q / usual_norm, _neighbours(len(whole), 3)
     medoid = scaled[whole][_medoids(scaled[whole], lambda a, b: np.minimum(*_distances(a, b)), around)]
     medoid *= np.cumprod(np.r_[1.0, _signs(medoid[1:], medoid[:-1])])[:, None]
     signs = _signs(scaled, medoid[_nearest(whole, len(q))])
@@ -302,14 +297,14 @@ def continuous_quaternions(q: FloatArray) -> FloatArray:
         signs = -signs
     divisor = np.full(len(q), usual_norm)
     divisor[whole] = np.where(np.abs(norms / usual_norm - 1.0) <= _OWN_NORM, norms, usual_norm)
-    divisor[np.abs(divisor - 1.0) <= _ROUNDING] = 1.0
+    divisor[np.abs(divisor - 1.0) <= 1e-9] = 1.0  # rounding
     return np.asarray(q * (signs / divisor)[:, None])
 
 
 def _distances(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distances ``(N,)`` of quaternions from others and from their opposites; an outlying component counts little."""
     near, far = (np.nan_to_num(np.abs(x)) for x in (a - b, a + b))
-    near, far = (np.minimum(x, _CAP) + _TIE * x for x in (near, far))
+    near, far = (np.minimum(x, 1.0) + 1e-9 * x for x in (near, far))  # the second term breaks ties
     return near.sum(axis=1), far.sum(axis=1)
 
 

@@ -34,13 +34,10 @@ if TYPE_CHECKING:
 __all__ = ["Bandwidth", "acting_inputs", "choose_bandwidth", "differentiate", "filter_rows"]
 
 
-_SHORTEST = 2.0 * REACH
 _LONGEST_BRIDGE = 0.25
-_BESIDE = 2
-# Bandwidth times sample interval, and bandwidth times duration, that are chosen at most and at least.
-_HIGHEST, _LONGEST = 0.1, 10.0
-_SEGMENTS, _SMALLEST_SEGMENT = 8, 32
-_SMOOTHING = 1.2
+"""Gaps that are bridged, at most, in periods of the bandwidth."""
+_HIGHEST = 0.1
+"""Bandwidth times sample interval that is chosen at most."""
 
 
 def differentiate(log: Log, model: Model, bandwidth: float | None = None) -> Log:
@@ -282,7 +279,7 @@ def choose_bandwidth(motions: list[tuple[FloatArray, int]], dt: float) -> Bandwi
     found = [x for values, order in motions if (x := _of_one_motion(values, order, dt)) is not None]
     chosen = min(found, key=lambda x: x.value, default=Bandwidth(_HIGHEST / dt, 1.0))
     n = max((len(values) for values, _ in motions), default=0)
-    lowest = min(_LONGEST / max(n * dt, dt), _HIGHEST / dt)
+    lowest = min(10.0 / max(n * dt, dt), _HIGHEST / dt)
     return Bandwidth(float(np.clip(chosen.value, lowest, _HIGHEST / dt)), chosen.noise_share)
 
 
@@ -307,7 +304,7 @@ def _acceleration_spectrum(values: FloatArray, order: int, dt: float) -> tuple[F
     frequencies to high ones; then a geometric mean over a fifth of the frequency to either side.
     """
     differences = np.diff(values - values.mean(), order) / dt**order
-    n = min(len(differences), max(_SMALLEST_SEGMENT, 2 * len(differences) // (_SEGMENTS + 1)))
+    n = min(len(differences), max(32, 2 * len(differences) // 9))  # eight segments, half of each in the next
     segments = np.lib.stride_tricks.sliding_window_view(differences, n)[:: max(1, n // 2)]
     spectra = np.abs(np.fft.rfft(np.hanning(n + 1)[:n] * segments, axis=1)) ** 2
     f = np.fft.rfftfreq(n, dt).astype(np.float64)
@@ -319,7 +316,7 @@ def _acceleration_spectrum(values: FloatArray, order: int, dt: float) -> tuple[F
 
 def _smooth(f: FloatArray, power: FloatArray) -> FloatArray:
     """The geometric mean of the power at ``f / 1.2`` to ``1.2 f``; 0 where there is none."""
-    low, high = np.searchsorted(f, f / _SMOOTHING, side="left"), np.searchsorted(f, f * _SMOOTHING, side="right")
+    low, high = np.searchsorted(f, f / 1.2, side="left"), np.searchsorted(f, f * 1.2, side="right")
     with np.errstate(divide="ignore", invalid="ignore"):
         total = np.concatenate([[0.0], np.cumsum(np.log(power))])
         mean = np.exp((total[high] - total[low]) / (high - low))
@@ -333,11 +330,11 @@ def _derivation_bandwidth(log: Log, bandwidth: float) -> float:
         raise SettingsError(
             f"a bandwidth of {bandwidth:.4g} Hz has no meaning at {1.0 / log.dt:.6g} Hz; give up to {highest:.4g} Hz"
         )
-    wide = min(4.0 * bandwidth, highest)
-    if bandwidth * duration < _SHORTEST or len(log) < 2 * half_length(wide, log.dt) + 2:
+    wide, n_periods = min(4.0 * bandwidth, highest), 2.0 * REACH
+    if bandwidth * duration < n_periods or len(log) < 2 * half_length(wide, log.dt) + 2:
         raise LogError(
             f"{log.source}: {duration:.4g} s are too short to be filtered at {bandwidth:.4g} Hz, which takes "
-            f"{_SHORTEST / bandwidth:.4g} s; give a longer log or a higher bandwidth"
+            f"{n_periods / bandwidth:.4g} s; give a longer log or a higher bandwidth"
         )
     return wide
 
@@ -351,9 +348,9 @@ def _bridge(values: FloatArray) -> FloatArray:
     rows = np.arange(len(values))
     bridged = np.interp(rows, rows[~missing], values[~missing])
     for begin, end in _gaps(missing):
-        near = slice(max(0, 2 * begin - end - _BESIDE), 2 * end - begin + _BESIDE)
+        near = slice(max(0, 2 * begin - end - 2), 2 * end - begin + 2)
         x, known = 2.0 * (rows[near] - begin) / (end - begin) - 1.0, ~missing[near]
-        if begin > 0 and end < len(values) and known.sum() > 2 * _BESIDE:
+        if begin > 0 and end < len(values) and known.sum() > 4:
             cubic = np.polynomial.polynomial.polyfit(x[known], values[near][known], 3)
             bridged[begin:end] = np.polynomial.polynomial.polyval(x[(rows[near] >= begin) & (rows[near] < end)], cubic)
     return bridged

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["despike", "hampel", "running_deviation", "window_deviation"]
 
 
-_MAD_TO_STD, _MEAN_TO_STD = 1.4826, 1.2533
-_COUNT_ROUNDING, _USUAL = 1e-3, 0.01
+_MAD_TO_STD = 1.4826
 
 
 def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, threshold: float = 8.0) -> Log:
@@ -109,7 +108,7 @@ def window_deviation(values: FloatArray, median: FloatArray, window: int) -> Flo
     """
     off = np.abs(_windows(values, window) - median[..., None])
     scale = _MAD_TO_STD * _of_finite(_middle, off)
-    scale = np.where(scale > 0.0, scale, _MEAN_TO_STD * _of_finite(np.mean, off))
+    scale = np.where(scale > 0.0, scale, 1.2533 * _of_finite(np.mean, off))
     return np.asarray(np.maximum(scale, np.apply_along_axis(_count, 0, values)))
 
 
@@ -160,5 +159,5 @@ def _count(values: FloatArray) -> float:
     if not len(changes):
         return 0.0
     smallest = float(changes.min())
-    usual = np.isclose(changes, smallest, rtol=_COUNT_ROUNDING).sum() > _USUAL * len(values)
-    return smallest if usual else 0.0
+    often = np.isclose(changes, smallest, rtol=1e-3).sum() > 0.01 * len(values)
+    return smallest if often else 0.0

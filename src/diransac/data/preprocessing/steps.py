@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
+from diransac.data.checks import is_implausible
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
@@ -43,8 +44,6 @@ __all__ = [
 
 Column = TypeVar("Column")
 
-# New rows per old one, of more than so many, that only a damaged time takes.
-_MOST_NEW, _MANY_ROWS = 1000, 100_000
 _ROUNDING = 1e-6
 
 
@@ -326,7 +325,7 @@ def resampling_grid(time: FloatArray, rate: float | str, source: str) -> tuple[F
     """Uniform time (n,) over that of a clock, and its rate in Hz.  Raises LogError, SettingsError: as `resample`."""
     hertz = _rate(rate, float(np.median(np.diff(time))))
     n = _new_rows(float(time[-1] - time[0]), hertz, source)
-    if n > max(_MANY_ROWS, _MOST_NEW * len(time)):
+    if is_implausible(n, len(time)):
         steps = np.diff(time)
         row = int(np.argmax(steps))
         raise LogError(

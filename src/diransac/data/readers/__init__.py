@@ -12,7 +12,7 @@ from diransac.data.files import place_of_metadata
 from diransac.data.log import Log
 from diransac.data.readers.reading import Reading
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import Table, with_metadata
+from diransac.data.readers.table import Table, readable, with_metadata
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, LARGEST_RESULT, LARGEST_TEXT, MOST_COUNTED, check_ordinary, read_bytes
 from diransac.plain_text import one_line
@@ -47,17 +47,16 @@ _RECORDINGS = {
 }
 """Ending -> module of this package, and what opens or reads a file there."""
 _REMEDIES = {
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
-    **dict.fromkeys((".dat", ".asc", ".log", ".prn"), "if it is text, rename it to .txt"),
-    **dict.fromkeys((".json", ".jsonl", ".pkl", ".pickle", ".feather"), "write it as CSV or Parquet"),
-    **dict.fromkeys((".bbl", ".bfl"), "convert it to CSV by Betaflight's blackbox_decode"),
-    **dict.fromkeys((".db3", ".yaml"), "name the folder of the bag"),
+    ".xlsx .xls .ods": "export the sheet as CSV",
+    ".dat .asc .log .prn": "if it is text, rename it to .txt",
+    ".json .jsonl .pkl .pickle .feather": "write it as CSV or Parquet",
+    ".bbl .bfl": "convert it to CSV by Betaflight's blackbox_decode",
+    ".db3 .yaml": "name the folder of the bag",
     ".bin": "of ArduPilot's, convert it to CSV by mavlogdump.py",
     ".npy": "name its columns: np.savez(file, t=..., x=...)",
 }
-"""Ending that is not read -> what to do."""
-_FOLDERS = {"metadata.yaml": "bags:open_bag"}
-"""File in a folder -> what opens the folder."""
+"""Endings that are not read -> what to do."""
+
 _ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
 
 
@@ -223,7 +222,7 @@ def read_topics(path: str | Path) -> TopicTable | None:
     Raises LogError: as `read_log`.
     """
     path = Path(path)
-    is_folder_of_tables = path.is_dir() and not any((path / marker).exists() for marker in _FOLDERS)
+    is_folder_of_tables = path.is_dir() and not _is_bag(path)
     if is_folder_of_tables or _ending(path) in (*_TEXTS, *_TABLES):
         return None
     from diransac.data.readers.topics import list_topics
@@ -269,9 +268,8 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
         is_crazyflie = file.read(1) == MAGIC
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
-    remedy = _REMEDIES.get(path.suffix.lower())
-    also = "" if remedy is None else f"; {remedy}"
-    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}{also}')
+    remedy = "".join(f"; {what}" for endings, what in _REMEDIES.items() if path.suffix.lower() in endings.split())
+    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}{remedy}')
 
 
 def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:
@@ -294,11 +292,14 @@ def _ending(path: Path) -> str | None:
     return max((x for x in _ENDINGS if path.name.lower().endswith(x)), key=len, default=None)
 
 
+def _is_bag(folder: Path) -> bool:
+    return (folder / "metadata.yaml").exists()
+
+
 def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recording:
     """A ROS 2 bag, or a table of the CSV files in a folder."""
-    for marker, place in _FOLDERS.items():
-        if (path / marker).exists():
-            return _imported(place)(path, source)
+    if _is_bag(path):
+        return _imported(_RECORDINGS[".bag"])(path, source)
     files = sorted(x for x in path.iterdir() if x.name.lower().endswith(tuple(_TEXTS)))
     if len(files) < 2:  # one file is a log of its own
         raise LogError(
@@ -311,26 +312,16 @@ def _opened_folder(path: Path, source: str, repairs: Repairs) -> Table | Recordi
 
 def _check_content(path: Path, source: str) -> None:
     """Raise LogError for a file that cannot be read, or is empty."""
-    try:
+    with readable(source):
         if not check_ordinary(path).st_size:
             raise LogError(f"{source}: it is empty")
-    except FileNotFoundError as error:
-        raise LogError(f"{source}: there is no such file") from error
-    except OSError as error:
-        raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
 
 
 def _content(path: Path, source: str, largest: int | None = None) -> bytes:
     """The bytes of a file; with the largest size of a log, unless there is another one."""
     is_text = _ending(path) in _TEXTS and not path.name.lower().endswith(".gz")
-    try:
+    with readable(source):
         data = read_bytes(path, largest or (LARGEST_TEXT if is_text else LARGEST_LOG))
-    except ValueError as error:
-        raise LogError(f"{source}: {error}; split it") from error
-    except FileNotFoundError as error:
-        raise LogError(f"{source}: there is no such file") from error
-    except OSError as error:
-        raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
     if not data:
         raise LogError(f"{source}: it is empty")
     return data

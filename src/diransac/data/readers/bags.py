@@ -13,19 +13,17 @@ import json
 import re
 import sys
 from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
 from diransac.data.readers.table import DAMAGE, undamaged
 from diransac.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-    from pathlib import Path
 
 __all__ = ["BagRecording", "McapFile", "RosBag", "damages", "open_bag", "open_mcap", "unpacked"]
 

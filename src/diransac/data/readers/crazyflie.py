@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +19,6 @@ from diransac.data.checks import as_doubles
 from diransac.data.readers.recording import Recording, Samples, Stamps
 from diransac.data.readers.table import undamaged
 from diransac.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 __all__ = ["MAGIC", "CrazyflieRecording"]
 

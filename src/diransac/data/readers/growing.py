@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from diransac.data.readers.bags import LARGEST_CHUNK, BagRecording, McapFile, da
 from diransac.data.readers.comma_separated import fields_of, head_of, read_csv
 from diransac.data.readers.recording import Samples
 from diransac.data.readers.repair import Repairs
-from diransac.data.readers.table import Table, undamaged
+from diransac.data.readers.table import Table, readable, undamaged
 from diransac.data.readers.topics import entries_of, is_one_table, signals_of, wanted_by
 from diransac.errors import LogError
 from diransac.limits import check_ordinary
@@ -45,21 +45,31 @@ _RECENT = 1000
 """Stamps of the fastest topic to which samples of others may belong: seconds, at any rate that is tracked."""
 
 
-class Growing(Protocol):
-    """A log that grows."""
+class Growing:
+    """A log that grows.
 
-    source: str
-    """Name in messages."""
+    Parameters
+    ----------
+    source : str
+        Name in messages.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source, self._notes = source, list[str]()
 
     @property
     def ended(self) -> bool:
         """True where nothing more will come."""
+        raise NotImplementedError
 
     def new(self) -> Part | None:
         """Rows that are complete since the last call; None without any.  Raises LogError: they cannot be read."""
+        raise NotImplementedError
 
     def taken_notes(self) -> list[str]:
         """Findings since the last call, a sentence each."""
+        notes, self._notes = self._notes, []
+        return notes
 
     def close(self) -> None:
         """Close what is open."""
@@ -94,18 +104,6 @@ def growing(path: Path, reading: Reading, like: Sequence[Mapping[str, Any]] = ()
 # ---------------------------------------------------------------------- bytes
 
 
-class Bytes(Protocol):
-    """Source of bytes."""
-
-    ended: bool
-
-    def new(self) -> tuple[bytes, str]:
-        """Bytes since the last call, and why they are the beginning of another file; empty where they are not."""
-
-    def close(self) -> None:
-        """Close what is open."""
-
-
 class FileEnd:
     """The end of a file that another program writes, also where it is cut off or replaced.
 
@@ -124,17 +122,13 @@ class FileEnd:
     ended = False
 
     def __init__(self, path: Path, source: str) -> None:
-        self._path, self._source = path, source
-        try:
+        self._path = path
+        with readable(source):
             check_ordinary(path)
             self._file = path.open("rb")
-        except FileNotFoundError as error:
-            raise LogError(f"{source}: there is no such file") from error
-        except OSError as error:
-            raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
 
     def new(self) -> tuple[bytes, str]:
-        """As `Bytes.new`, a block at most."""
+        """Bytes since the last call, a block at most, and why they are the beginning of another file; else empty."""
         own = os.fstat(self._file.fileno())
         if own.st_size < self._file.tell():
             self._file.seek(0)
@@ -147,7 +141,7 @@ class FileEnd:
         return data, ""
 
     def close(self) -> None:
-        """As `Bytes.close`."""
+        """Close the file."""
         self._file.close()
 
     def _is_replaced(self, own: os.stat_result) -> bool:
@@ -172,19 +166,19 @@ class Pipe:
         self._stream, self.ended = stream, False
 
     def new(self) -> tuple[bytes, str]:
-        """As `Bytes.new`."""
+        """As `FileEnd.new`."""
         data: bytes = self._stream.read1(_BLOCK)
         self.ended = not data
         return data, ""
 
     def close(self) -> None:
-        """As `Bytes.close`; the stream belongs to the process."""
+        """Do nothing: the stream belongs to the process."""
 
 
 # ---------------------------------------------------------------------- CSV
 
 
-class GrowingCsv:
+class GrowingCsv(Growing):
     """CSV text that grows by lines; the last line counts when its line break is there.
 
     A line with another number of fields than the header, as after a break of power, is left out and said.  A field that
@@ -192,7 +186,7 @@ class GrowingCsv:
 
     Parameters
     ----------
-    data : Bytes
+    data : FileEnd or Pipe
     source : str
     reading : Reading
         Names, factors and mapping.
@@ -200,11 +194,13 @@ class GrowingCsv:
         History of a log of the same recorder, as in `read_log`.
     """
 
-    def __init__(self, data: Bytes, source: str, reading: Reading, like: Sequence[Mapping[str, Any]] = ()) -> None:
-        self.source, self._data, self._reading, self._like = source, data, reading, like
+    def __init__(
+        self, data: FileEnd | Pipe, source: str, reading: Reading, like: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        super().__init__(source)
+        self._data, self._reading, self._like = data, reading, like
         self._rest, self._waiting, self._head = b"", list[str](), list[str]()
-        self._has_head, self._notes = False, list[str]()
-        self._numeric, self._ready = set[str](), list[Table]()
+        self._has_head, self._numeric, self._ready = False, set[str](), list[Table]()
 
     @property
     def ended(self) -> bool:
@@ -214,11 +210,6 @@ class GrowingCsv:
     def close(self) -> None:
         """As `Growing.close`."""
         self._data.close()
-
-    def taken_notes(self) -> list[str]:
-        """As `Growing.taken_notes`."""
-        notes, self._notes = self._notes, []
-        return notes
 
     def new(self) -> Part | None:
         """As `Growing.new`."""
@@ -331,7 +322,7 @@ class _Topics(BagRecording):
         return self._zero
 
 
-class GrowingMcap:
+class GrowingMcap(Growing):
     """Recording in MCAP that grows by messages, or by chunks as its writer closes them.
 
     The rows are those of the topic that is fastest at the beginning.  A sample of another topic stands at the time of
@@ -353,12 +344,12 @@ class GrowingMcap:
     """
 
     def __init__(self, path: Path, source: str, reading: Reading, like: Sequence[Mapping[str, Any]] = ()) -> None:
-        self.source, self._path = source, path
+        super().__init__(source)
+        self._path = path
         self._mapping, self._rename = reading.topics(like)
         self._file = _McapEnd(path, source)
         self._recording: _Topics | None = None
         self._entries: list[MappedSignals] = []
-        self._notes = list[str]()
         self._waits: LogError | None = None
         self._fastest, self._stamps = "", np.empty(0)
         self._ahead: dict[str, Samples] = {}
@@ -371,14 +362,6 @@ class GrowingMcap:
             raise self._waits
         return is_read
 
-    def close(self) -> None:
-        """As `Growing.close`; the file is opened at each look."""
-
-    def taken_notes(self) -> list[str]:
-        """As `Growing.taken_notes`."""
-        notes, self._notes = self._notes, []
-        return notes
-
     def new(self) -> Part | None:
         """As `Growing.new`."""
         if self._is_cut_off():
@@ -387,8 +370,7 @@ class GrowingMcap:
         if self._recording is None and not self._begin():
             return None
         assert self._recording is not None
-        stamps = "header" if self._mapping is None else self._mapping.time
-        read = self._recording.read(wanted_by(self._entries), stamps)
+        read = self._recording.read(wanted_by(self._entries), "header" if self._mapping is None else self._mapping.time)
         parts = {n: signals_of(n, x, self._entries, Repairs(), self.source) for n, x in read.items()}
         self._fastest = self._fastest or max(parts, key=lambda name: len(parts[name].time))
         units = {name: unit for entry in self._entries for name, unit in entry.known_units().items()}
@@ -397,10 +379,8 @@ class GrowingMcap:
 
     def _is_cut_off(self) -> bool:
         """True where the file is shorter than what was read of it.  Raises LogError: it cannot be read."""
-        try:
+        with readable(self.source):
             return check_ordinary(self._path).st_size < self._file.offset and self._recording is not None
-        except OSError as error:
-            raise LogError(f"{self.source}: it cannot be read: {error.strerror}") from error
 
     def _begin(self) -> bool:
         """Find the signals among the topics; False while they are not there."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from itertools import count
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +14,6 @@ import numpy.typing as npt
 from diransac.data.readers.table import Table, check_shapes, table_of_arrays, undamaged
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 __all__ = ["MAGIC", "read_hdf5"]
 
@@ -45,7 +43,7 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
         ) from error
     arrays: dict[str, npt.NDArray[Any]] = {}
     with undamaged(f"{source}: it is not an HDF5 file, or is damaged"), h5py.File(io.BytesIO(data), "r") as file:
-        found = dict(_Walk(source).datasets(file, "", ()))
+        found = dict(_datasets(file, "", (), source, count(1)))
         check_shapes([dataset.shape[::-1] if transposed else dataset.shape for dataset in found.values()], source)
         n_chunks = sum(_n_chunks(dataset) for dataset in found.values())
         if n_chunks > _MOST_CHUNKS:
@@ -57,33 +55,27 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
     return table_of_arrays(arrays, source)
 
 
-@dataclass
-class _Walk:
-    """Walk over the groups of a file, in which a few links may make endless paths."""
+def _datasets(
+    group: Any, prefix: str, above: tuple[Any, ...], source: str, n_links: count[int]
+) -> Iterator[tuple[str, Any]]:
+    """Numeric datasets below a group, by dotted names; what MATLAB keeps for itself, ``#refs#``, is left out.
 
-    source: str
-    n_links: int = 0
+    Raises LogError: the paths to them have too many links, of which a few may make endless paths.
+    """
+    import h5py
 
-    def datasets(self, group: Any, prefix: str, above: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
-        """Numeric datasets below a group, by dotted names; what MATLAB keeps for itself, ``#refs#``, is left out.
-
-        Raises LogError: the paths to them have too many links.
-        """
-        import h5py
-
-        if group in above or len(above) >= 16:
-            return
-        for name in group:
-            self.n_links += 1
-            if self.n_links > _MOST_LINKS:
-                raise LogError(f"{self.source}: it has {beyond(_MOST_LINKS, 'links')}; write its datasets alone")
-            if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                continue
-            item = group[name]
-            if isinstance(item, h5py.Group):
-                yield from self.datasets(item, f"{prefix}{name}.", (*above, group))
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
-                yield f"{prefix}{name}", item
+    if group in above or len(above) >= 16:
+        return
+    for name in group:
+        if next(n_links) > _MOST_LINKS:
+            raise LogError(f"{source}: it has {beyond(_MOST_LINKS, 'links')}; write its datasets alone")
+        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            yield from _datasets(item, f"{prefix}{name}.", (*above, group), source, n_links)
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.shape is not None:
+            yield f"{prefix}{name}", item
 
 
 def _n_chunks(dataset: Any) -> int:

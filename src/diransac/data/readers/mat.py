@@ -12,8 +12,9 @@ import io
 import math
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +23,8 @@ from diransac.data.readers import hdf5
 from diransac.data.readers.table import Table, check_unique, table_of_arrays, undamaged
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 __all__ = ["read_mat"]
 
-_HEADER, _DEEPEST = 128, 8
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _STRUCTURE, _COMPLEX = 2, 0x0800
@@ -97,7 +94,7 @@ class _Elements:
 def _level_5(data: bytes) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Arrays of a file of version 5, those of structures by dotted names."""
     order = "<" if data[126:128] == b"IM" else ">"
-    elements = _Elements(memoryview(data)[_HEADER:], order)
+    elements = _Elements(memoryview(data)[128:], order)
     budget = LARGEST_LOG
     while elements:
         kind, content = elements.take()
@@ -131,7 +128,7 @@ def _arrays(content: memoryview, order: str, name: str, depth: int) -> Iterator[
         if min(shape, default=-1) < 0 or math.prod(shape) != len(values):
             raise ValueError(f'"{name}" has {len(values)} numbers for the size {shape}')
         yield name, values.reshape(shape, order="F")
-    elif kind == _STRUCTURE and math.prod(shape) == 1 and depth < _DEEPEST:
+    elif kind == _STRUCTURE and math.prod(shape) == 1 and depth < 8:
         yield from _fields(elements, order, name, depth)
     else:
         yield name, np.array(_CLASSES.get(kind, "an array of structures or of complex numbers"))

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["is_numeric", "numbers_of", "read_parquet", "scanned"]
 
 _MAGIC = b"PAR1"
-_INDEX = {"__index_level_0__": "timestamp"}
-"""Name that pandas gives to its index, which is that of the rows, where it has none."""
 
 
 def read_parquet(data: bytes, source: str) -> Table:
@@ -49,9 +47,10 @@ def read_parquet(data: bytes, source: str) -> Table:
         name: numbers[header] if header in numbers else _first(few[header])
         for (name, _), header in zip(named, schema, strict=True)
     }
-    named_times = {_INDEX.get(name, name): x for name, x in times.items() if x is not None}
+    index = {"__index_level_0__": "timestamp"}  # how pandas calls its index, which is that of the rows
+    named_times = {index.get(name, name): x for name, x in times.items() if x is not None}
     units = {name: unit for name, unit in named if unit is not None}
-    table = Table({_INDEX.get(name, name): x for name, x in columns.items()}, units, times=named_times)
+    table = Table({index.get(name, name): x for name, x in columns.items()}, units, times=named_times)
     return table if metadata is None else with_metadata(table, metadata, source)
 
 
@@ -113,9 +112,6 @@ def _first(series: pl.Series) -> str:
 
 # ---------------------------------------------------------------------- footer
 
-_ROW_GROUPS, _CHUNKS, _ABOUT, _N_VALUES = 4, 1, 3, 5
-"""Fields of the footer: a list of row groups, each a list of columns, each with facts, one of them a number."""
-
 
 class _FooterError(ValueError):
     """The footer is damaged."""
@@ -129,9 +125,10 @@ def _declared(data: bytes) -> list[int]:
     References: Apache Parquet, parquet.thrift; Apache Thrift, "Thrift Compact protocol".
     """
     size = int.from_bytes(data[-8:-4], "little")
+    row_groups, chunks, about, n_values = 4, 1, 3, 5
     try:
         footer = _Compact(data[max(4, len(data) - 8 - size) : -8]).structure(0)
-        return [int(x[_ABOUT][_N_VALUES]) for group in footer[_ROW_GROUPS] for x in group[_CHUNKS]]
+        return [int(x[about][n_values]) for group in footer[row_groups] for x in group[chunks]]
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise _FooterError("its footer cannot be read") from error
 

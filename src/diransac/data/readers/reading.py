@@ -202,20 +202,12 @@ def _mapped(step: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, "rename": dict(step.get("renamed", {}))}
 
 
-def _factors(step: Mapping[str, Any]) -> dict[str, Any]:
-    return {"scale": dict(step["factors"]), "units": dict(step.get("units", {}))}
-
-
-def _names(step: Mapping[str, Any]) -> Sequence[str]:
-    return tuple(step["names"])
-
-
 _ARGUMENTS: dict[str, Any] = {
-    "columns": lambda step: {"columns": _names(step)},
+    "columns": lambda step: {"columns": tuple(step["names"])},
     "clock": lambda step: {"rate": step["rate"]},
     "rename": lambda step: {"rename": dict(step["names"])},
     "map": _mapped,
-    "scale": _factors,
+    "scale": lambda step: {"scale": dict(step["factors"]), "units": dict(step.get("units", {}))},
     "repair": lambda step: {"repair": tuple(step["repairs"])},
     "resample": lambda step: {"resample": step["rate"]},
     "despike": lambda step: {"despike": tuple(step["replaced"])},

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +14,6 @@ from diransac.data.checks import check_time_order
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
 from diransac.text_table import some
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 __all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since", "shortened"]
 

@@ -8,9 +8,10 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +25,9 @@ from diransac.errors import LogError
 from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
 from diransac.plain_text import one_line
 
-if TYPE_CHECKING:
-    from collections.abc import Container, Iterator, Mapping, Sequence
-
 __all__ = [
-    "DAMAGE", "Table", "check_shapes", "check_size", "check_unique", "seconds", "table_of_arrays", "time_column",
-    "undamaged", "unit_of_name", "with_metadata",
+    "DAMAGE", "Table", "check_shapes", "check_size", "check_unique", "readable", "seconds", "table_of_arrays",
+    "time_column", "undamaged", "unit_of_name", "with_metadata",
 ]  # fmt: skip
 
 
@@ -50,6 +48,22 @@ def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterat
     except errors as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise LogError(f"{what} ({why:.150})") from error
+
+
+@contextmanager
+def readable(source: str) -> Iterator[None]:
+    """Context in which a file is opened and read.  Raises LogError: there is none, it cannot be read, or is too large.
+
+    A ValueError is that of `limits.read_bytes`.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise LogError(f"{source}: {error}; split it") from error
+    except FileNotFoundError as error:
+        raise LogError(f"{source}: there is no such file") from error
+    except OSError as error:
+        raise LogError(f"{source}: it cannot be read: {error.strerror}") from error
 
 
 @dataclass(frozen=True)

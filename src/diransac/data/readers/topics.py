@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.data.clock import is_even
 from diransac.data.mapping import LogMapping, MappedSignals, held
 from diransac.data.readers.recording import Recording, Samples, align, find_field, shortened
 from diransac.data.readers.table import Table
@@ -98,7 +99,8 @@ def table_of_topics(
     entries, notes = entries_of(recording, mapping, rename)
     read = recording.read(wanted_by(entries), "header" if mapping is None else mapping.time)
     parts = {topic: signals_of(topic, samples, entries, repairs, source) for topic, samples in read.items()}
-    if "clock" in repairs and resample is None and len(parts) > 1 and not _is_even(parts):
+    fastest = min(parts.values(), key=lambda x: x.interval)
+    if "clock" in repairs and resample is None and len(parts) > 1 and not is_even(fastest.time):
         resample = "median"
         repairs.record("clock", "the topics' clocks are uneven; resampled at the median rate of the fastest")
     made = align(parts, resample if len(parts) > 1 else None, source)
@@ -186,12 +188,6 @@ def signals_of(
             unusable |= dict.fromkeys(entry.names, why) if why else {}
             signals |= {} if why else entry.apply(columns)
     return repairs.ordered(Samples(samples.time, signals, unusable), topic)
-
-
-def _is_even(parts: Mapping[str, Samples]) -> bool:
-    """True for a fastest topic whose intervals differ by less than a fifth."""
-    steps = np.diff(min(parts.values(), key=lambda x: x.interval).time)
-    return bool(len(steps) == 0 or np.abs(steps - steps.mean()).max() <= 0.2 * steps.mean())
 
 
 def _origins(entries: Sequence[MappedSignals]) -> dict[str, str]:

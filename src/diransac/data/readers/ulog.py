@@ -10,8 +10,10 @@ import mmap
 import re
 import struct
 from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +21,6 @@ import numpy.typing as npt
 from diransac.data.checks import as_doubles
 from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
 from diransac.errors import LogError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
 __all__ = ["UlogRecording"]
 
