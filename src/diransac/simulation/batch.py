@@ -413,6 +413,7 @@ class Simulator(Protocol):
 
         The sign of a quaternion is ignored: its four simulated components change sign where that is nearer.
         """
+        return self.errors_and_ends(batch, measurements, threads=threads)[0]
 
     def errors_and_ends(
         self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1

@@ -81,10 +81,6 @@ class MujocoRollouts(Simulator):
         bits = np.packbits(inliers, axis=0, bitorder="little")
         return ScoreBatch(batch, squares, inliers.sum(axis=1), diverged, bits)
 
-    def errors(self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1) -> FloatArray:
-        """Simulated less measured; see `Simulator.errors`."""
-        return self.errors_and_ends(batch, measurements, threads=threads)[0]
-
     def errors_and_ends(
         self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1
     ) -> tuple[FloatArray, FloatArray]:

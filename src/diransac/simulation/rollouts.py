@@ -187,10 +187,6 @@ class Rollouts(Simulator):
         n = lanes.n_lanes
         return ScoreBatch(batch, sums[:, :n].T.copy(), counts[0, :n].copy(), counts[1, :n] != 0, bits)
 
-    def errors(self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1) -> FloatArray:
-        """Simulated less measured, (n_lanes, n_rows, n_s), NaN from a divergence on; see `Simulator.errors`."""
-        return self.errors_and_ends(batch, measurements, threads=threads)[0]
-
     def errors_and_ends(
         self, batch: RolloutBatch, measurements: Measurements, *, threads: int = 1
     ) -> tuple[FloatArray, FloatArray]:

@@ -7,43 +7,35 @@ do, and no number is moved.  The search ends when one number is left.
 
 from __future__ import annotations
 
-from llvmlite import ir
-
-from diransac.simulation.compiler.machine_code import LANES
-from diransac.simulation.compiler.vectors import INTEGER, INTEGERS, POINTER, Value, Vectors, integer
+from diransac.simulation.compiler.machine_code import LANES, signature
+from diransac.simulation.compiler.vectors import INTEGER, INTEGERS, Value, Vectors, integer, new_function
 
 __all__ = ["emit_bisection"]
 
-_BITS = 63
 
-
-def emit_bisection(name: str) -> Value:
-    """LLVM module with one function.
+def emit_bisection() -> Value:
+    """LLVM module with one function, `order_statistics`.
 
     Its arguments are the arrays `values` (n_rows, width), `places` (n_rows,) and `found` (n_rows,), and the sizes
     n_rows and width, which is a multiple of eight.
     """
-    module = ir.Module(name)
-    of = ir.FunctionType(ir.VoidType(), [POINTER] * 3 + [INTEGER] * 2)
-    function = ir.Function(module, of, name)
+    function = new_function("order_statistics", signature(3, 2))
     values, places, found, n_rows, width = function.args
-    v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+    v = Vectors(function)
     with v.repeat(integer(0), n_rows) as row:
         numbers = v.builder.gep(values, [v.builder.mul(row.index, width)], source_etype=INTEGER)
         least = _lower_bound(v, numbers, v.load(places, row.index, INTEGER), width)
         v.store(_smallest_from(v, numbers, least, width), found, row.index)
     v.builder.ret_void()
-    return module
+    return function.module
 
 
 def _lower_bound(v: Vectors, numbers: Value, place: Value, width: Value) -> Value:
     """Bits that are at most those of the number sought, and more than those of the number before it."""
     b = v.builder
     least, n_below, n_up_to = v.variable(integer(0)), v.variable(integer(0)), v.variable(width)
-    for variable, value in ((least, integer(0)), (n_below, integer(0)), (n_up_to, width)):
-        v.set(variable, value)
-    with v.repeat(integer(0), integer(_BITS)) as step:
-        bit = b.shl(integer(1), b.sub(integer(_BITS - 1), step.index))
+    with v.repeat(integer(0), integer(63)) as step:  # without the sign
+        bit = b.shl(integer(1), b.sub(integer(62), step.index))
         low = v.get(least)
         count = _count_up_to(v, numbers, b.or_(low, b.sub(bit, integer(1))), width)
         is_higher = b.icmp_signed("<=", count, place)
@@ -58,7 +50,6 @@ def _lower_bound(v: Vectors, numbers: Value, place: Value, width: Value) -> Valu
 def _count_up_to(v: Vectors, numbers: Value, most: Value, width: Value) -> Value:
     """Number of the numbers whose bits are at most so many."""
     b, bound, total = v.builder, v.splat(most), v.variable(v.integer(0))
-    v.set(total, v.integer(0))
     with v.repeat(integer(0), b.sdiv(width, integer(LANES))) as loop:
         some = v.load(numbers, b.mul(loop.index, integer(LANES)), INTEGERS)
         v.set(total, v.count(v.get(total), b.icmp_signed("<=", some, bound)))
@@ -72,7 +63,6 @@ def _smallest_from(v: Vectors, numbers: Value, least: Value, width: Value) -> Va
     """Bits of the smallest number whose bits are at least so many."""
     b, bound, largest = v.builder, v.splat(least), integer(2**63 - 1)
     smallest = v.variable(v.splat(largest))
-    v.set(smallest, v.splat(largest))
     with v.repeat(integer(0), b.sdiv(width, integer(LANES))) as loop:
         some = v.load(numbers, b.mul(loop.index, integer(LANES)), INTEGERS)
         is_next = b.and_(b.icmp_signed(">=", some, bound), b.icmp_signed("<", some, v.get(smallest)))

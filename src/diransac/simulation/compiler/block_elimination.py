@@ -19,33 +19,29 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 
-from diransac.simulation.compiler.machine_code import LANES
-from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, NUMBERS, POINTER, Value, Vectors, integer
+from diransac.simulation.compiler.machine_code import LANES, signature
+from diransac.simulation.compiler.vectors import DOUBLE, NUMBERS, Value, Vectors, integer, new_function
 
 __all__ = ["emit_block_elimination"]
 
 
-def emit_block_elimination(name: str) -> Value:
-    """LLVM module with one function.
+def emit_block_elimination() -> Value:
+    """LLVM module with one function, `solve_blocks`.
 
     Its arguments are the arrays `blocks` (n, k, 2 padded_k + padded_c), `below` (n - 1, k, k), `inverse_below`
     (n - 1, padded_k, padded_k) and `pivots` (n, k), and the sizes n, k, padded_k and padded_c.  A row of a block has
     those of D_w, E_w' and R_w beside each other, padded by zeros to whole vectors, which S_w, Y_w and X_w replace.
     `inverse_below` is zero at first; `pivots` are the least that are admitted, which the pivots replace.
     """
-    module = ir.Module(name)
-    of = ir.FunctionType(ir.VoidType(), [POINTER] * 4 + [INTEGER] * 4)
-    function = ir.Function(module, of, name)
-    for array in function.args[:4]:
-        array.add_attribute("noalias")
-    emitter = _Emitter(Vectors(ir.IRBuilder(function.append_basic_block("entry"))), *function.args)
+    function = new_function("solve_blocks", signature(4, 4))
+    emitter = _Emitter(Vectors(function), *function.args)
     with emitter.v.repeat(integer(0), emitter.n) as block:
         emitter.eliminate(block.index)
         emitter.invert(block.index)
     with emitter.v.repeat(integer(0), emitter.n) as counter:
         emitter.substitute(emitter.b.sub(emitter.b.sub(emitter.n, integer(1)), counter.index))
     emitter.b.ret_void()
-    return module
+    return function.module
 
 
 @dataclass(frozen=True)

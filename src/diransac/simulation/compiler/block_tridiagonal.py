@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function
+from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function, signature
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
 
 __all__ = ["BlockSolution", "solve_blocks"]
-
-_SIGNATURE = {
-    **dict.fromkeys(("blocks", "below", "inverse_below", "pivots"), "pointer"),
-    **dict.fromkeys(("n", "k", "padded_k", "padded_c"), "integer"),
-}
 
 
 class BlockSolution(NamedTuple):
@@ -83,6 +78,6 @@ def _code() -> MachineCode:
     def emit() -> Value:
         from diransac.simulation.compiler.block_elimination import emit_block_elimination
 
-        return emit_block_elimination("solve_blocks")
+        return emit_block_elimination()
 
-    return compile_function(emit, (), "solve_blocks", _SIGNATURE.values())
+    return compile_function(emit, (), "solve_blocks", signature(4, 4))

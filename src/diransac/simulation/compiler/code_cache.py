@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["CodeCache", "hashed"]
 
 
-MAGIC = b"diransac machine code 1\n"
-
-
 @dataclass(frozen=True)
 class CodeCache:
     """Folder of machine code.
@@ -99,7 +96,11 @@ class CodeCache:
 
     def sizes(self) -> dict[Path, int]:
         """Bytes of each entry, the one used the longest ago first."""
-        return {path: found.st_size for path, found in self._files("*.code")}
+        found = []
+        for path in self.folder.glob("*.code"):
+            with suppress(FileNotFoundError):  # another process has removed it meanwhile
+                found.append((path, path.stat()))
+        return {path: entry.st_size for path, entry in sorted(found, key=lambda one: one[1].st_mtime)}
 
     def clear(self) -> None:
         """Remove all entries.
@@ -111,14 +112,6 @@ class CodeCache:
 
     def _path(self, key: str) -> Path:
         return self.folder / f"{key}.code"
-
-    def _files(self, pattern: str) -> list[tuple[Path, os.stat_result]]:
-        """Files and their states by age, without those that another process has removed meanwhile."""
-        found = []
-        for path in self.folder.glob(pattern):
-            with suppress(FileNotFoundError):
-                found.append((path, path.stat()))
-        return sorted(found, key=lambda entry: entry[1].st_mtime)
 
     def _trim(self) -> None:
         """Remove the oldest entries beyond the limit."""
@@ -142,7 +135,7 @@ def hashed(parts: Iterable[str]) -> str:
 
 def _head(key: str) -> bytes:
     """First bytes of an entry."""
-    return MAGIC + key.encode() + b"\n"
+    return b"diransac machine code 1\n" + key.encode() + b"\n"
 
 
 def _user_folder() -> Path:

@@ -12,8 +12,15 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
 from diransac.simulation.compiler.graph import check_compilable, read_graph
-from diransac.simulation.compiler.lanes import ARGUMENTS, Lanes, arranged_lanes, map_signature, time_loop_arguments
-from diransac.simulation.compiler.machine_code import LANES, MachineCode, Target, compile_function, run_blocks
+from diransac.simulation.compiler.lanes import ARGUMENTS, Lanes, arranged_lanes, time_loop_arguments
+from diransac.simulation.compiler.machine_code import (
+    LANES,
+    MachineCode,
+    Target,
+    compile_function,
+    run_blocks,
+    signature,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -40,14 +47,14 @@ class _Compiled:
         check_compilable(function)
 
     def _variant(
-        self, kind: str, variant: object, emit: Callable[[], Value], signature: Collection[str]
+        self, kind: str, variant: object, emit: Callable[[], Value], arguments: Collection[str]
     ) -> MachineCode:
         """Machine code of one variant, compiled when it is first asked for."""
         with self._lock:
             if variant not in self._code:
                 definition = (kind, self._serialized, repr(variant))
                 name = "map_loop" if kind == "map" else "time_loop"
-                self._code[variant] = compile_function(emit, definition, name, signature, self._target)
+                self._code[variant] = compile_function(emit, definition, name, arguments, self._target)
             return self._code[variant]
 
 
@@ -110,7 +117,7 @@ class Map(_Compiled):
             graph = read_graph(self._function, [k for k, fixed in enumerate(shared) if fixed])
             return emit_map_loop(graph, self._widths_in)
 
-        return self._variant("map", shared, emit, map_signature(len(self._widths_in) + len(self._widths_out)))
+        return self._variant("map", shared, emit, signature(len(self._widths_in) + len(self._widths_out), 3))
 
 
 def compile_map(function: ca.Function, target: Target | None = None) -> Map:

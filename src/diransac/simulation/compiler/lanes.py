@@ -28,7 +28,6 @@ __all__ = [
     "arranged_measurements",
     "arranged_weights",
     "checked_array",
-    "map_signature",
     "run_time_loop",
     "squared_thresholds",
     "time_loop_arguments",
@@ -66,14 +65,6 @@ ARGUMENTS = {
     "end_block": "integer",
 }
 """Arguments of the compiled time loop, in order, and their kinds."""
-
-_VALUES = tuple(name for name in ARGUMENTS if not name.endswith("_block"))
-"""Arguments that are the same for all blocks."""
-
-
-def map_signature(n_arrays: int) -> list[str]:
-    """Kinds of the compiled function's arguments: inputs and outputs, n_rows, first_block, end_block."""
-    return ["pointer"] * n_arrays + ["integer"] * 3
 
 
 @dataclass(frozen=True)
@@ -256,11 +247,12 @@ def run_time_loop(code: MachineCode, lanes: Lanes, values: Mapping[str, Any], th
     run_blocks(code.call, time_loop_arguments(lanes, values), lanes.n_padded // LANES, threads)
 
 
-def time_loop_arguments(lanes: Lanes, values: Mapping[str, Any]) -> list[Any]:
+def time_loop_arguments(lanes: Lanes, given: Mapping[str, Any]) -> list[Any]:
     """Arguments of the compiled time loop, all but the blocks; arrays as addresses, which do not keep them alive."""
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
-    known = {**lanes.arrays, **values, **sizes}
-    return [array.ctypes.data if isinstance(array := known.get(name), np.ndarray) else array or 0 for name in _VALUES]
+    known = {**lanes.arrays, **given, **sizes}
+    values = [known.get(name, 0) for name in ARGUMENTS if not name.endswith("_block")]
+    return [value.ctypes.data if isinstance(value, np.ndarray) else value for value in values]
 
 
 def aligned(shape: tuple[int, ...]) -> FloatArray:

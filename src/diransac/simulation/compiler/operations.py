@@ -5,21 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from llvmlite import ir
-
 from diransac.errors import ModelError
 from diransac.limits import MOST_COMPILED, beyond
 from diransac.simulation.compiler import elementary
-from diransac.simulation.compiler.lanes import map_signature
-from diransac.simulation.compiler.machine_code import LANES
-from diransac.simulation.compiler.vectors import DOUBLE, INTEGER, POINTER, Value, Vectors, integer
+from diransac.simulation.compiler.machine_code import LANES, signature
+from diransac.simulation.compiler.vectors import DOUBLE, Value, Vectors, integer, new_function
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "numbers"]
+__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "evaluate_into", "numbers"]
 
 
 @dataclass(frozen=True)
@@ -30,12 +27,10 @@ class Operation:
     ----------
     emit : called with the vectors and one value for each operand; returns the result
     takes : kind of each operand, `n` a number, `c` a condition
-    gives : kind of the result
     """
 
     emit: Callable[..., Value]
     takes: str = "n"
-    gives: str = "n"
 
 
 def _same(_v: Vectors, x: Value, *_: Value) -> Value:
@@ -68,13 +63,13 @@ OPERATIONS: dict[str, Operation] = {
     "REMAINDER": Operation(lambda v, x, y: v.libm("remainder", x, y), "nn"),
     "HYPOT": Operation(elementary.hypot, "nn"),
     # conditions
-    "LT": Operation(lambda v, x, y: v.compare("<", x, y), "nn", "c"),
-    "LE": Operation(lambda v, x, y: v.compare("<=", x, y), "nn", "c"),
-    "EQ": Operation(lambda v, x, y: v.compare("==", x, y), "nn", "c"),
-    "NE": Operation(lambda v, x, y: v.compare("!=", x, y), "nn", "c"),
-    "NOT": Operation(lambda v, x: v.negate(x), "c", "c"),
-    "AND": Operation(lambda v, x, y: v.both(x, y), "cc", "c"),
-    "OR": Operation(lambda v, x, y: v.either(x, y), "cc", "c"),
+    "LT": Operation(lambda v, x, y: v.compare("<", x, y), "nn"),
+    "LE": Operation(lambda v, x, y: v.compare("<=", x, y), "nn"),
+    "EQ": Operation(lambda v, x, y: v.compare("==", x, y), "nn"),
+    "NE": Operation(lambda v, x, y: v.compare("!=", x, y), "nn"),
+    "NOT": Operation(lambda v, x: v.negate(x), "c"),
+    "AND": Operation(lambda v, x, y: v.both(x, y), "cc"),
+    "OR": Operation(lambda v, x, y: v.either(x, y), "cc"),
     "IF_ELSE_ZERO": Operation(lambda v, c, x: v.select(c, x, v.number(0.0)), "cn"),
     # exponentials
     "EXP": Operation(elementary.exp),
@@ -101,7 +96,6 @@ OPERATIONS: dict[str, Operation] = {
     "ATAN2": Operation(elementary.atan2, "nn"),
 }
 """Vector form of every operation of an expression graph, by CasADi's name for it; FMA, FMS and FNMA are ours."""
-
 
 _LONG = frozenset(name for name, operation in OPERATIONS.items() if operation.emit.__module__ == elementary.__name__)
 """Operations that are written out as some hundred instructions."""
@@ -165,6 +159,19 @@ def numbers(v: Vectors, values: Mapping[int, Value], positions: Collection[int])
     return [_as_kind(v, values[position], "n") for position in positions]
 
 
+def evaluate_into(
+    v: Vectors,
+    array: Value,
+    graph: Graph,
+    wanted: Collection[int],
+    load: Callable[[int, int], Value],
+    known: Mapping[int, Value] | None = None,
+) -> None:
+    """Emit instructions as `evaluate` does, and their results as the vectors of an array."""
+    for k, value in enumerate(numbers(v, evaluate(v, graph, wanted, load, known), wanted)):
+        v.put(value, array, k)
+
+
 def _vector_form(name: str) -> Operation:
     """Entry of the table."""
     if name not in OPERATIONS:
@@ -184,7 +191,7 @@ def _as_kind(v: Vectors, value: Value, kind: str) -> Value:
 
 # A loop over rows ----------------------------------------------------------------------------------------------------
 def emit_map_loop(graph: Graph, widths_in: Sequence[int]) -> Value:
-    """LLVM module with one function, `map_loop`, that takes `map_signature`.
+    """LLVM module with one function, `map_loop`, of the inputs, the outputs, n_rows, first_block and end_block.
 
     Parameters
     ----------
@@ -193,29 +200,22 @@ def emit_map_loop(graph: Graph, widths_in: Sequence[int]) -> Value:
 
     The outputs' arrays are (n_rows, width).
     """
-    module = ir.Module("diransac")
-    kinds = {"pointer": POINTER, "integer": INTEGER}
-    signature = map_signature(len(widths_in) + len(graph.outputs))
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [kinds[k] for k in signature]), "map_loop")
-    arrays, (n_rows, first_block, end_block) = function.args[:-3], function.args[-3:]
-    for array in arrays:
-        array.add_attribute("noalias")
-    v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
-    load_shared = _shared_loader(v, arrays)
+    function = new_function("map_loop", signature(len(widths_in) + len(graph.outputs), 3))
+    *arrays, n_rows, first_block, end_block = function.args
+    v = Vectors(function)
+
+    def shared(argument: int, element: int) -> Value:
+        return v.splat(v.load(arrays[argument], integer(element), DOUBLE))
+
     wanted = [k for row in graph.outputs for k in row]
-    known = evaluate(v, graph, [k for k in graph.needed(wanted) if graph.invariant[k]], load_shared)
+    known = evaluate(v, graph, [k for k in graph.needed(wanted) if graph.invariant[k]], shared)
     with v.repeat(first_block, end_block) as blocks:
-        rows = _rows(v, blocks.index, n_rows)
+        rows = v.lanes_from(v.builder.mul(blocks.index, integer(LANES)), n_rows)
         values = evaluate(v, graph, wanted, _row_loader(v, arrays, widths_in, rows), known)
         for array, positions in zip(arrays[len(widths_in) :], graph.outputs, strict=True):
             _store(v, array, rows, numbers(v, values, positions))
     v.builder.ret_void()
-    return module
-
-
-def _shared_loader(v: Vectors, arrays: Sequence[Value]) -> Callable[[int, int], Value]:
-    """Loader of elements that all rows share."""
-    return lambda argument, element: v.splat(v.load(arrays[argument], integer(element), DOUBLE))
+    return function.module
 
 
 def _row_loader(
@@ -227,15 +227,6 @@ def _row_loader(
         return v.join([v.load(arrays[argument], _place(v, row, widths[argument], element), DOUBLE) for row in rows])
 
     return load
-
-
-def _rows(v: Vectors, block: Value, n_rows: Value) -> list[Value]:
-    """Rows of a block; those past the end are the last one."""
-    builder = v.builder
-    last = builder.sub(n_rows, integer(1))
-    first = builder.mul(block, integer(LANES))
-    rows = [builder.add(first, integer(lane)) for lane in range(LANES)]
-    return [builder.select(builder.icmp_signed("<", row, last), row, last) for row in rows]
 
 
 def _place(v: Vectors, row: Value, width: int, element: int) -> Value:

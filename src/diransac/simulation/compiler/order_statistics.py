@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function
+from diransac.simulation.compiler.machine_code import LANES, MachineCode, compile_function, signature
 
 if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
 
 __all__ = ["order_statistics", "padded_rows"]
-
-_SIGNATURE = {**dict.fromkeys(("values", "places", "found"), "pointer"), "n_rows": "integer", "width": "integer"}
 
 
 def padded_rows(shape: tuple[int, ...]) -> FloatArray:
@@ -60,6 +58,6 @@ def _code() -> MachineCode:
     def emit() -> Value:
         from diransac.simulation.compiler.bisection import emit_bisection
 
-        return emit_bisection("order_statistics")
+        return emit_bisection()
 
-    return compile_function(emit, (), "order_statistics", _SIGNATURE.values())
+    return compile_function(emit, (), "order_statistics", signature(3, 2))

@@ -12,7 +12,6 @@ from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.vectors import BYTE, DOUBLE, INTEGER, Value, integer
 
 if TYPE_CHECKING:
-    from diransac.simulation.compiler.sensitivities import Columns
     from diransac.simulation.compiler.time_loop import Block, LoopRow, TimeLoop
 
 __all__ = [
@@ -20,31 +19,34 @@ __all__ = [
     "ErrorOutput",
     "GaussNewtonOutput",
     "LinearizedErrorOutput",
+    "Output",
     "ScoreOutput",
     "SignalOutput",
 ]
 
 
-class _Output:
-    """Base of the outputs: the loop, and errors against the measurements."""
+class Output:
+    """Output of a variant of the loop; it emits its own code into the loop that it is made with."""
 
     ends_early = False
+    """True if a block ends once all its lanes have diverged."""
 
     def __init__(self, loop: TimeLoop) -> None:
         self.loop, self.v, self.specification, self.arguments = loop, loop.v, loop.specification, loop.arguments
 
     def start(self, block: Block) -> None:
-        """Nothing before the first row."""
+        """Emit the code before a block's first row."""
+
+    def row(self, block: Block, row: LoopRow) -> None:
+        """Emit the output of a row."""
+        raise NotImplementedError
 
     def end(self, block: Block) -> None:
-        """Nothing after the last row."""
+        """Emit the code after a block's last row."""
 
     def lanes(self, block: Block) -> list[Value]:
         """Numbers of a block's lanes; the last lane stands for those that fill the block."""
-        builder = self.loop.builder
-        last = builder.sub(self.arguments["n_lanes"], integer(1))
-        own = [builder.add(block.first, integer(lane)) for lane in range(LANES)]
-        return [builder.select(builder.icmp_signed("<", x, last), x, last) for x in own]
+        return self.v.lanes_from(block.first, self.arguments["n_lanes"])
 
     def errors(self, block: Block, row: LoopRow) -> list[Value]:
         """Simulated less measured; a quaternion, and its derivatives, first take the sign that is nearer."""
@@ -59,7 +61,7 @@ class _Output:
 
 
 # Sums ----------------------------------------------------------------------------------------------------------------
-class ScoreOutput(_Output):
+class ScoreOutput(Output):
     """`sums` (n_s, n_padded) of squared errors, and `counts` (2, n_padded): inliers, and 1 where the lane diverged.
 
     `inlier_bits` (n_blocks, n_rows) has a bit for every inlier, up to the row at which all lanes have diverged.
@@ -109,7 +111,7 @@ class ScoreOutput(_Output):
         v.store(flag, self.arguments["counts"], builder.add(n_padded, block.first))
 
 
-class GaussNewtonOutput(_Output):
+class GaussNewtonOutput(Output):
     """`first` (n_lanes, 1 + n_z) of e'we and J'we, `matrix` (n_lanes, n_z, n_z) of J'wJ, and `final` states.
 
     The sums exceed the registers: each is loaded, increased and stored, close together for a block, with unknowns in
@@ -122,7 +124,8 @@ class GaussNewtonOutput(_Output):
 
     def __init__(self, loop: TimeLoop) -> None:
         super().__init__(loop)
-        self.columns = _columns_of(loop)
+        assert loop.columns is not None
+        self.columns = loop.columns
         groups = self.columns.groups
         self.first_unknowns = list(accumulate((len(group.unknowns) for group in groups), initial=0))
         self.n_z = self.first_unknowns[-1]
@@ -266,15 +269,8 @@ class GaussNewtonOutput(_Output):
         self.v.put(self.v.select(lanes, self.v.number(value), self.v.pick(array, index)), array, index)
 
 
-def _columns_of(loop: TimeLoop) -> Columns:
-    """Derivatives of a loop that simulates them."""
-    if loop.columns is None:
-        raise TypeError("this output takes derivatives, which the loop does not simulate")
-    return loop.columns
-
-
 # Series --------------------------------------------------------------------------------------------------------------
-class _SeriesOutput(_Output):
+class _SeriesOutput(Output):
     """`series` (n_lanes, n_rows, width) of `values`, NaN from a lane's divergence on."""
 
     def values(self, block: Block, row: LoopRow) -> list[Value]:
@@ -336,7 +332,8 @@ class LinearizedErrorOutput(_SeriesOutput):
     def values(self, block: Block, row: LoopRow) -> list[Value]:
         """Errors of the scored signals, then their derivatives."""
         values = self.errors(block, row)
-        columns = _columns_of(self.loop)
+        columns = self.loop.columns
+        assert columns is not None
         for group, slopes in zip(columns.groups, columns.slopes, strict=True):
             for column in range(len(group.unknowns)):
                 found = dict.fromkeys(range(len(self.specification.scored)), self.v.number(0.0))

@@ -14,8 +14,8 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from diransac.simulation.compiler.operations import evaluate, numbers
-from diransac.simulation.compiler.stage_function import StageFunction
+from diransac.simulation.compiler.operations import evaluate, evaluate_into, numbers
+from diransac.simulation.compiler.stage_function import StageCalls, StageFunction
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.graph import Graph
     from diransac.simulation.compiler.vectors import Value, Vectors
 
-__all__ = ["ColumnGroup", "Columns", "DerivativeSpecification", "Points"]
-
-_COLUMN, _SHARED, _DRIVING, _STEP = range(4)
+__all__ = ["ColumnGroup", "Columns", "DerivativeSpecification"]
 
 
 @dataclass(frozen=True)
@@ -65,21 +63,6 @@ class DerivativeSpecification:
     groups: tuple[ColumnGroup, ...]
     jacobians: Graph
     n_stages: int
-
-
-@dataclass(frozen=True)
-class Points:
-    """Values of a sub-step of the state.
-
-    Attributes
-    ----------
-    states, inputs : of each stage
-    quaternions : components after the sub-step, before they are scaled to length one
-    """
-
-    states: list[list[Value]]
-    inputs: list[list[Value]]
-    quaternions: list[Value]
 
 
 class _Places:
@@ -126,38 +109,39 @@ class Columns:
             [places.add(elements) for elements in _rows_of(group, graph.outputs[1])] for group in self.groups
         ]
         self._places = places
-        self._stage = StageFunction("jacobians", graph, tuple(places.varying), *sizes)
-        self._function = self._stage.declare(v.builder.module)
-        self._function.linkage = "internal"
-        self._stage.emit(self._function)
-        self._constants = v.array(len(self._stage.constants))
+        stage = StageFunction("jacobians", graph, tuple(places.varying), *sizes)
+        function = stage.declare(v.builder.module)
+        function.linkage = "internal"
+        stage.emit(function)
+        self._stages = StageCalls(v, stage, function, specification.n_stages)
         self._fixed = v.array(len(places.fixed))
-        self._varying = [v.array(len(places.varying)) for _ in range(specification.n_stages)]
         self._quaternions = v.array(n_quaternions)
         self.state = [v.array(len(group.unknowns) * len(group.rows)) for group in self.groups]
         self.slopes = [v.array(len(group.unknowns) * len(group.signals)) for group in self.groups]
 
     # A block ---------------------------------------------------------------------------------------------------------
-    def start(self, parameter: Callable[[int], Value]) -> None:
+    def start(self, load: Callable[[int, int], Value]) -> None:
         """Emit the derivatives of the initial state, and what the parameters alone determine."""
-        v, graph = self.v, self.specification.jacobians
+        v = self.v
         for group, array in zip(self.groups, self.state, strict=True):
             for k, value in enumerate(chain(*group.initial)):
                 v.put(v.number(value), array, k)
-        self._stage.put_constants(v, parameter, self._constants)
-        fixed = self._places.fixed
-        results = evaluate(v, graph, fixed, lambda _argument, element: parameter(element))
-        for k, value in enumerate(numbers(v, results, fixed)):
-            v.put(value, self._fixed, k)
+        self._stages.start(load)
+        evaluate_into(v, self._fixed, self.specification.jacobians, self._places.fixed, load)
 
     # A sub-step ------------------------------------------------------------------------------------------------------
-    def advance(self, points: Points) -> None:
-        """Emit the derivatives of the signals before a sub-step, and those of the state after it."""
-        v = self.v
-        for x, u, varying in zip(points.states, points.inputs, self._varying, strict=True):
-            self._stage.call(v, self._function, [*x, *u], self._constants, varying)
-        for k, value in enumerate(points.quaternions):
-            v.put(value, self._quaternions, k)
+    def advance(self, points: Sequence[Sequence[Value]], quaternions: Sequence[Value]) -> None:
+        """Emit the derivatives of the signals before a sub-step, and those of the state after it.
+
+        Parameters
+        ----------
+        points : state and inputs of each stage
+        quaternions : components after the sub-step, before they are scaled to length one
+        """
+        for stage, point in enumerate(points):
+            self._stages.at(stage, point)
+        for k, value in enumerate(quaternions):
+            self.v.put(value, self._quaternions, k)
         for number in range(len(self.groups)):
             self._advance_group(number)
 
@@ -200,15 +184,10 @@ class Columns:
         v, n_rows = self.v, len(self.groups[number].rows)
         n_driving, n_shared = len(self._driving[number]), len(self._shared)
 
-        def load(argument: int, element: int) -> Value:
-            if argument == _STEP:
-                return v.splat(self.step)
-            if argument == _COLUMN:
-                return v.pick(self.state[number], v.affine(column, n_rows, element))
-            if argument == _DRIVING:
-                stage, k = divmod(element, n_driving)
-                is_fixed, first = self._driving[number][k]
-                return v.pick(self._array(is_fixed, stage), v.affine(column, 1, first))
+        def own(element: int) -> Value:
+            return v.pick(self.state[number], v.affine(column, n_rows, element))
+
+        def shared(element: int) -> Value:
             first_quaternion = n_shared * self.specification.n_stages
             if element >= first_quaternion:
                 return v.pick(self._quaternions, element - first_quaternion)
@@ -216,11 +195,17 @@ class Columns:
             is_fixed, place = self._shared[k]
             return v.pick(self._array(is_fixed, stage), place)
 
-        return load
+        def driving(element: int) -> Value:
+            stage, k = divmod(element, n_driving)
+            is_fixed, first = self._driving[number][k]
+            return v.pick(self._array(is_fixed, stage), v.affine(column, 1, first))
+
+        sources = own, shared, driving, lambda _element: v.splat(self.step)
+        return lambda argument, element: sources[argument](element)
 
     def _array(self, is_fixed: bool, stage: int) -> Value:
         """Array of a stage's values, or of those that are fixed."""
-        return self._fixed if is_fixed else self._varying[stage]
+        return self._fixed if is_fixed else self._stages.results[stage]
 
 
 def _rows_of(group: ColumnGroup, elements: Sequence[int]) -> list[list[int]]:

@@ -10,19 +10,16 @@ from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from llvmlite import ir
-
-from diransac.simulation.compiler.operations import evaluate, numbers
-from diransac.simulation.compiler.vectors import POINTER, Value, Vectors
+from diransac.simulation.compiler.machine_code import signature
+from diransac.simulation.compiler.operations import evaluate_into
+from diransac.simulation.compiler.vectors import Value, Vectors, new_function
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["StageFunction", "stage_module"]
-
-_POINT, _INPUT, _PARAMETER = range(3)
+__all__ = ["StageCalls", "StageFunction", "stage_module"]
 
 
 @dataclass(frozen=True)
@@ -53,42 +50,55 @@ class StageFunction:
             k for k in operands | set(self.results) if graph.invariant[k] and graph.instructions[k].operation != "CONST"
         )
 
-    def declare(self, module: Value) -> Value:
-        """Function of a module, without its body."""
-        function = ir.Function(module, ir.FunctionType(ir.VoidType(), [POINTER] * 3), self.name)
-        for argument in function.args:
-            argument.add_attribute("noalias")
-        return function
+    def declare(self, module: Value = None) -> Value:
+        """Function of a module, a new one by default, without its body."""
+        return new_function(self.name, signature(3, 0), module)
 
     def emit(self, function: Value) -> None:
         """Emit the body of a declared function."""
         point, constants, results = function.args
-        v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+        v = Vectors(function)
         v.align_frame()
         values = [v.pick(point, k) for k in range(self.n_states + self.n_inputs)]
-        sources = {_POINT: values[: self.n_states], _INPUT: values[self.n_states :]}
+        sources = values[: self.n_states], values[self.n_states :]
         known = {k: v.pick(constants, i) for i, k in enumerate(self.constants)}
-        found = evaluate(v, self.graph, self.results, lambda argument, k: sources[argument][k], known)
-        for k, value in enumerate(numbers(v, found, self.results)):
-            v.put(value, results, k)
+        evaluate_into(v, results, self.graph, self.results, lambda argument, k: sources[argument][k], known)
         v.builder.ret_void()
 
-    def put_constants(self, v: Vectors, parameter: Callable[[int], Value], array: Value) -> None:
-        """Emit the computation of the constants into an array, from the elements of the parameters."""
-        found = evaluate(v, self.graph, self.constants, lambda _argument, element: parameter(element))
-        for k, value in enumerate(numbers(v, found, self.constants)):
-            v.put(value, array, k)
 
-    def call(self, v: Vectors, function: Value, point: Sequence[Value], constants: Value, results: Value) -> None:
-        """Emit a call at a state and inputs."""
-        array = v.array(len(point))
+class StageCalls:
+    """Emitter of the calls of a function by the stages of a sub-step.
+
+    Attributes
+    ----------
+    results : array of the results in each stage
+    """
+
+    def __init__(self, v: Vectors, stage: StageFunction, function: Value, n_stages: int) -> None:
+        """`function` is the stage's own in the module, declared."""
+        self._v, self._stage, self._function = v, stage, function
+        self._constants = v.array(len(stage.constants))
+        self.results = [v.array(len(stage.results)) for _ in range(n_stages)]
+
+    def start(self, load: Callable[[int, int], Value]) -> None:
+        """Emit what the parameters of a block's lanes determine."""
+        evaluate_into(self._v, self._constants, self._stage.graph, self._stage.constants, load)
+
+    def at(self, stage: int, point: Sequence[Value]) -> None:
+        """Emit the call of a stage, at a state and inputs."""
+        array = self._v.array(len(point))
         for k, value in enumerate(point):
-            v.put(value, array, k)
-        v.builder.call(function, [array, constants, results])
+            self._v.put(value, array, k)
+        self._v.builder.call(self._function, [array, self._constants, self.results[stage]])
+
+    def result(self, element: int) -> Value:
+        """Emit the load of an element of all stages' results."""
+        stage, place = divmod(element, len(self._stage.results))
+        return self._v.pick(self.results[stage], place)
 
 
 def stage_module(stage: StageFunction) -> Value:
     """LLVM module with a stage's function alone."""
-    module = ir.Module("diransac")
-    stage.emit(stage.declare(module))
-    return module
+    function = stage.declare()
+    stage.emit(function)
+    return function.module

@@ -8,31 +8,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
-
-from llvmlite import ir
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from diransac.simulation.compiler.lanes import ARGUMENTS
 from diransac.simulation.compiler.machine_code import LANES
 from diransac.simulation.compiler.operations import evaluate, numbers
-from diransac.simulation.compiler.sensitivities import Columns, Points
+from diransac.simulation.compiler.sensitivities import Columns
+from diransac.simulation.compiler.stage_function import StageCalls
 from diransac.simulation.compiler.vectors import (
     DOUBLE,
-    INTEGER,
     INTEGERS,
     NUMBERS,
-    POINTER,
     Loop,
     Value,
     Variable,
     Vectors,
     integer,
+    new_function,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from diransac.simulation.compiler.graph import Graph
+    from diransac.simulation.compiler.outputs import Output
     from diransac.simulation.compiler.sensitivities import DerivativeSpecification
     from diransac.simulation.compiler.stage_function import StageFunction
 
@@ -41,7 +40,6 @@ __all__ = [
     "InputSource",
     "LoopRow",
     "LoopSpecification",
-    "Output",
     "TimeLoop",
     "emit_time_loop",
     "inputs_by_feedback",
@@ -51,7 +49,8 @@ __all__ = [
 
 T = TypeVar("T")
 
-STATE, INPUT, PARAMETER, STEP, RESULT = range(5)
+PARAMETER, STEP, RESULT = 2, 3, 4
+"""Arguments of a step after the state and the inputs; those of a stage end with the parameters."""
 
 
 @dataclass(frozen=True)
@@ -122,24 +121,6 @@ class LoopRow:
     alive: Value
 
 
-class Output(Protocol):
-    """Output of a variant of the loop; it emits its own code into the loop that it is made with."""
-
-    ends_early: bool
-    """True if a block ends once all its lanes have diverged."""
-
-    def __init__(self, loop: TimeLoop) -> None: ...
-
-    def start(self, block: Block) -> None:
-        """Emit the code before a block's first row."""
-
-    def row(self, block: Block, row: LoopRow) -> None:
-        """Emit the output of a row."""
-
-    def end(self, block: Block) -> None:
-        """Emit the code after a block's last row."""
-
-
 InputSource: TypeAlias = "Callable[[TimeLoop, Block, Value], list[Value]]"
 """Emits the inputs of a block's lanes at a row."""
 
@@ -148,16 +129,9 @@ def emit_time_loop(
     specification: LoopSpecification, output: type[Output], inputs: InputSource, *, windows: bool
 ) -> Value:
     """LLVM module with one function, `time_loop`, that takes `ARGUMENTS`."""
-    module = ir.Module("diransac")
-    kinds = {"pointer": POINTER, "integer": INTEGER, "number": DOUBLE}
-    signature = ir.FunctionType(ir.VoidType(), [kinds[kind] for kind in ARGUMENTS.values()])
-    function = ir.Function(module, signature, "time_loop")
-    for argument, (name, kind) in zip(function.args, ARGUMENTS.items(), strict=True):
-        argument.name = name
-        if kind == "pointer":
-            argument.add_attribute("noalias")
+    function = new_function("time_loop", ARGUMENTS.values())
     TimeLoop(specification, windows, function).emit(output, inputs)
-    return module
+    return function.module
 
 
 class TimeLoop:
@@ -165,8 +139,8 @@ class TimeLoop:
 
     def __init__(self, specification: LoopSpecification, windows: bool, function: Value) -> None:
         self.specification, self.windows = specification, windows
-        self.arguments = {argument.name: argument for argument in function.args}
-        self.v = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+        self.arguments = dict(zip(ARGUMENTS, function.args, strict=True))
+        self.v = Vectors(function)
         self.builder = self.v.builder
         self.v.align_frame()
         self.state: list[Variable] = [self.v.variable(self.v.number(0.0)) for _ in range(specification.n_states)]
@@ -178,11 +152,12 @@ class TimeLoop:
             sizes = specification.n_states, specification.n_inputs - specification.n_changes
             n_quaternions = 4 * len(specification.state_quaternions)
             self.columns = Columns(self.v, specification.derivatives, self.arguments["step"], sizes, n_quaternions)
-        self._called: _Called | None = None
+        self._called: StageCalls | None = None
         """The dynamics, if stages call them."""
         if specification.dynamics is not None:
             n_stages = len(specification.step.outputs[2]) // specification.n_states
-            self._called = _Called(self.v, specification.dynamics, n_stages)
+            function = specification.dynamics.declare(self.v.builder.module)
+            self._called = StageCalls(self.v, specification.dynamics, function, n_stages)
 
     def emit(self, variant: type[Output], inputs: InputSource) -> None:
         """Emit the whole function."""
@@ -209,13 +184,10 @@ class TimeLoop:
                 return self._lane_vector("parameters", element, first)
             return v.splat(self.arguments["step"])
 
-        def parameter(element: int) -> Value:
-            return load(PARAMETER, element)
-
         if self.columns is not None:
-            self.columns.start(parameter)
+            self.columns.start(load)
         if self._called is not None:
-            self._called.start(parameter)
+            self._called.start(load)
         graph = specification.step
         constant = [k for k in graph.needed(chain(*graph.outputs)) if graph.invariant[k]]
         starts = self.whole_numbers("start_rows", first) if self.windows else []
@@ -248,10 +220,11 @@ class TimeLoop:
         if self.columns is not None:
             states, inputs, quaternions = points
             n_stages = len(states) // specification.n_states
-            self.columns.advance(Points(_split(states, n_stages), _split(inputs, n_stages), quaternions))
+            at_stages = zip(_split(states, n_stages), _split(inputs, n_stages), strict=True)
+            self.columns.advance([x + u for x, u in at_stages], quaternions)
         return signals, after
 
-    def _call(self, called: _Called, u: list[Value], known: dict[int, Value]) -> dict[int, Value]:
+    def _call(self, called: StageCalls, u: list[Value], known: dict[int, Value]) -> dict[int, Value]:
         """Emit the calls of the dynamics, each at a point that depends on the results before; what is known then."""
         graph, n_stages = self.specification.step, len(called.results)
         states, inputs = (_split(graph.outputs[k], n_stages) for k in (2, 3))
@@ -305,7 +278,7 @@ class TimeLoop:
         def load(argument: int, element: int) -> Value:
             if argument == RESULT and self._called is not None:
                 return self._called.result(element)
-            return (x if argument == STATE else u)[element]
+            return (x, u)[argument][element]
 
         return evaluate(self.v, graph, list(wanted), load, known)
 
@@ -330,33 +303,6 @@ class TimeLoop:
         """One element of an array that holds a value for every lane."""
         index = self.builder.add(self.builder.mul(self.arguments["n_padded"], integer(element)), first)
         return self.v.load(self.arguments[name], index, NUMBERS)
-
-
-class _Called:
-    """Emitter of the calls of a function by the stages of a sub-step.
-
-    Attributes
-    ----------
-    results : array of the results in each stage
-    """
-
-    def __init__(self, v: Vectors, function: StageFunction, n_stages: int) -> None:
-        self._v, self._stage, self._function = v, function, function.declare(v.builder.module)
-        self._constants = v.array(len(function.constants))
-        self.results = [v.array(len(function.results)) for _ in range(n_stages)]
-
-    def start(self, parameter: Callable[[int], Value]) -> None:
-        """Emit what the parameters of a block's lanes determine."""
-        self._stage.put_constants(self._v, parameter, self._constants)
-
-    def at(self, stage: int, point: Sequence[Value]) -> None:
-        """Emit the call of a stage, at a state and inputs."""
-        self._stage.call(self._v, self._function, point, self._constants, self.results[stage])
-
-    def result(self, element: int) -> Value:
-        """Emit the load of an element of all stages' results."""
-        stage, place = divmod(element, len(self._stage.results))
-        return self._v.pick(self.results[stage], place)
 
 
 def _split(values: Sequence[T], n: int) -> list[list[T]]:

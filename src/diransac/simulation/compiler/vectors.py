@@ -16,22 +16,20 @@ from llvmlite import ir
 from diransac.simulation.compiler.machine_code import LANES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
-__all__ = ["Loop", "Value", "Variable", "Vectors", "integer"]
+__all__ = ["Loop", "Value", "Variable", "Vectors", "integer", "new_function"]
 
 Value: TypeAlias = Any
 """An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
 
 DOUBLE = ir.DoubleType()
 INTEGER = ir.IntType(64)
-BIT = ir.IntType(1)
-BYTE = ir.IntType(8)
-BITS = ir.IntType(LANES)
+BYTE = ir.IntType(8)  # and a bit for each lane
 POINTER = ir.PointerType()
 NUMBERS = ir.VectorType(DOUBLE, LANES)
 INTEGERS = ir.VectorType(INTEGER, LANES)
-CONDITIONS = ir.VectorType(BIT, LANES)
+CONDITIONS = ir.VectorType(ir.IntType(1), LANES)
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,34 @@ def _number(digits: str) -> Value:
     return ir.Constant(NUMBERS, [ir.Constant(DOUBLE, float.fromhex(digits))] * LANES)
 
 
-class Vectors:
-    """Emitter of arithmetic on vectors of eight lanes, at the end of a builder's block."""
+def new_function(name: str, signature: Iterable[str], module: Value = None) -> Value:
+    """Function without a body in a module, a new one by default.  Its arrays do not overlap.
 
-    def __init__(self, builder: Value) -> None:
-        self.builder = builder
+    Parameters
+    ----------
+    signature : kind of each argument, as of `compile_function`
+    """
+    types = {"pointer": POINTER, "integer": INTEGER, "number": DOUBLE}
+    kind = ir.FunctionType(ir.VoidType(), [types[one] for one in signature])
+    function = ir.Function(module or ir.Module("diransac"), kind, name)
+    for argument in function.args:
+        if argument.type == POINTER:
+            argument.add_attribute("noalias")
+    return function
+
+
+class Vectors:
+    """Emitter of arithmetic on vectors of eight lanes, into a new function.
+
+    `add`, `sub`, `mul`, `div` and `neg` are of numbers, `add_integers` and `exclusive_or` of integers; `both`, `either`
+    and `negate` of conditions or, bit by bit, of integers; ``select(condition, x, y)`` is x where it holds, else y.
+    """
+
+    def __init__(self, function: Value) -> None:
+        self.builder = emit = ir.IRBuilder(function.append_basic_block("entry"))
+        self.add, self.sub, self.mul, self.div, self.neg = emit.fadd, emit.fsub, emit.fmul, emit.fdiv, emit.fneg
+        self.add_integers, self.exclusive_or = emit.add, emit.xor
+        self.both, self.either, self.negate, self.select = emit.and_, emit.or_, emit.not_, emit.select
         self._memory: dict[tuple[str, Value], Value] = {}
 
     def align_frame(self) -> None:
@@ -95,26 +116,6 @@ class Vectors:
         return ir.Constant(INTEGERS, [ir.Constant(INTEGER, value)] * LANES)
 
     # Arithmetic ----------------------------------------------------------------------------------------------------
-    def add(self, x: Value, y: Value) -> Value:
-        """Return x + y."""
-        return self.builder.fadd(x, y)
-
-    def sub(self, x: Value, y: Value) -> Value:
-        """Return x - y."""
-        return self.builder.fsub(x, y)
-
-    def mul(self, x: Value, y: Value) -> Value:
-        """Return x y."""
-        return self.builder.fmul(x, y)
-
-    def div(self, x: Value, y: Value) -> Value:
-        """Return x / y."""
-        return self.builder.fdiv(x, y)
-
-    def neg(self, x: Value) -> Value:
-        """Return -x."""
-        return self.builder.fneg(x)
-
     def fma(self, x: Value, y: Value, z: Value) -> Value:
         """Return x y + z, rounded once."""
         return self.intrinsic("fma", x, y, z)
@@ -182,29 +183,13 @@ class Vectors:
         """Return where x is NaN."""
         return self.builder.fcmp_unordered("uno", x, x)
 
-    def select(self, condition: Value, x: Value, y: Value) -> Value:
-        """Return x where the condition holds, else y."""
-        return self.builder.select(condition, x, y)
-
-    def both(self, x: Value, y: Value) -> Value:
-        """Return the logical and of conditions, or the bitwise one of integers."""
-        return self.builder.and_(x, y)
-
-    def either(self, x: Value, y: Value) -> Value:
-        """Return the logical or of conditions, or the bitwise one of integers."""
-        return self.builder.or_(x, y)
-
-    def negate(self, condition: Value) -> Value:
-        """Return the logical not."""
-        return self.builder.not_(condition)
-
     def count(self, total: Value, condition: Value) -> Value:
         """Return integers that grow by one where the condition holds."""
         return self.builder.sub(total, self.builder.sext(condition, INTEGERS))
 
     def any_lane(self, condition: Value) -> Value:
         """Return one bit, set if the condition holds in some lane."""
-        return self.builder.icmp_unsigned("!=", self.builder.bitcast(condition, BITS), ir.Constant(BITS, 0))
+        return self.builder.icmp_unsigned("!=", self.builder.bitcast(condition, BYTE), ir.Constant(BYTE, 0))
 
     def turned_towards(
         self, values: Sequence[Value], targets: Sequence[Value], places: Sequence[int]
@@ -239,14 +224,6 @@ class Vectors:
         """Return where the sign of x is minus, zeros included."""
         return self.builder.icmp_signed("<", self.bits(x), self.integer(0))
 
-    def add_integers(self, x: Value, y: Value) -> Value:
-        """Return x + y, modulo 2**64."""
-        return self.builder.add(x, y)
-
-    def exclusive_or(self, x: Value, y: Value) -> Value:
-        """Return the bits that differ."""
-        return self.builder.xor(x, y)
-
     def shift_left(self, x: Value, places: int) -> Value:
         """Return x 2**places, modulo 2**64."""
         return self.builder.shl(x, self.integer(places))
@@ -279,6 +256,13 @@ class Vectors:
         zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
         return self.builder.shuffle_vector(first, undefined, zeros)
 
+    def lanes_from(self, first: Value, n: Value) -> list[Value]:
+        """Return the numbers of eight lanes from the first on, those past the end of n being the last."""
+        builder = self.builder
+        last = builder.sub(n, integer(1))
+        lanes = [builder.add(first, integer(lane)) for lane in range(LANES)]
+        return [builder.select(builder.icmp_signed("<", lane, last), lane, last) for lane in lanes]
+
     def load(self, base: Value, index: Value, kind: Value) -> Value:
         """Load a scalar, or a vector that starts, at element `index` of an array."""
         element = kind.element if isinstance(kind, ir.VectorType) else kind
@@ -296,7 +280,7 @@ class Vectors:
 
     def store_bits(self, condition: Value, base: Value, index: Value) -> None:
         """Store a condition at element `index` of an array of bytes, the first lane in the lowest bit."""
-        self.builder.store(self.builder.bitcast(condition, BITS), self.builder.gep(base, [index], source_etype=BITS))
+        self.builder.store(self.builder.bitcast(condition, BYTE), self.builder.gep(base, [index], source_etype=BYTE))
 
     def array(self, size: int) -> Value:
         """Return a new array of vectors, on the stack."""
@@ -368,7 +352,7 @@ class Vectors:
             function.linkage = "internal"
             for attribute in ("noinline", "cold"):
                 function.attributes.add(attribute)
-            aside = Vectors(ir.IRBuilder(function.append_basic_block("entry")))
+            aside = Vectors(function)
             aside.builder.ret(emit(aside, *function.args))
         return self.builder.call(function, operands)
 
