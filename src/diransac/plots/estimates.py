@@ -15,6 +15,7 @@ from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.plots.figure import (
     INK,
+    LINE,
     MUTED,
     PAPER,
     RULE,
@@ -22,11 +23,10 @@ from diransac.plots.figure import (
     WIDTH,
     axes_at,
     check_ending,
-    draw_heading,
-    empty_figure,
-    header_height,
+    headed_figure,
     write,
     write_at,
+    write_caption,
 )
 from diransac.plots.study import axis_label, level_labels, method_looks, n_trials, title_of
 from diransac.study.method_choice import TRUE
@@ -43,15 +43,6 @@ __all__ = ["LEAST", "LogAxis", "MarkRow", "evaluates_parameters", "methods_and_e
 
 LEAST = -3
 """Power of ten, %, below which errors are not resolved."""
-
-
-# Inches: name of the panel with the values above its rows, values below, a line of the caption.
-_ABOVE, _BELOW, _LINE = 0.42, 0.3, 0.155
-_CAPTION = (
-    "Marks are medians over {trials} of a level, lines end at the largest. Errors are relative to the pseudo-true "
-    "parameters, the best of the",
-    "model in that flight; where those differ from the true ones, a second row has the errors relative to the latter.",
-)
 
 
 def plot_estimates(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -135,38 +126,33 @@ def _drawn(summary: Summary, title: str) -> Figure:
     every = _as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
     scale, heading = LogAxis.of(rows, LEAST), axis_label(summary)
-    caption = _caption(summary, scale)
-    header = header_height(list(looks.items()), title)
-    top, height = header + _ABOVE, _row_height(len(methods)) * len(rows)
-    figure = empty_figure(top + height + _BELOW + _LINE * len(caption) + 0.08)
-    draw_heading(figure, list(looks.items()), title)
+    caption = [
+        f"Marks are medians over {n_trials(summary)} of a level, lines end at the largest. Errors are relative to the "
+        "pseudo-true parameters, the best of the",
+        "model in that flight; where those differ from the true ones, a second row has the errors relative to the "
+        "latter." + " none: no estimate, counted as an infinite error." * scale.endless,
+        *filter(None, [summary.remark]),
+    ]
+    # Inches: name of the panel with the values above its rows, and values below.
+    above, below = 0.42, 0.3
+    height = _row_height(len(methods)) * len(rows)
+    figure, header = headed_figure(list(looks.items()), title, above + height + below + LINE * len(caption) + 0.08)
+    top = header + above
     left = _names_width([row.name for row in rows], heading)
     write_at(figure, left, header, "Error of the worst parameter, %", fontsize=9.5, color=INK)
     _name_rows(figure, (left, top), rows, len(methods), heading)
     _draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, scale)
-    for line, text in enumerate(caption):
-        write_at(figure, 0.1, top + height + _BELOW + line * _LINE, text)
+    write_caption(figure, top + height + below, caption)
     return figure
-
-
-def _caption(summary: Summary, scale: LogAxis) -> list[str]:
-    """Lines of the caption."""
-    first, second = _CAPTION
-    lines = [
-        first.format(trials=n_trials(summary)),
-        second + " none: no estimate, counted as an infinite error." * scale.endless,
-    ]
-    return [*lines, summary.remark] if summary.remark else lines
 
 
 # Rows of marks -------------------------------------------------------------------------------------------------------
 Looks = Mapping[str, Mapping[str, Any]]
 
-# Inches: height of a row per method, its margin, its least height; least distances of labelled decades and of labels.
-_METHOD, _FREE, _LEAST = 0.044, 0.075, 0.24
-_APART, _NEAR = 0.5, 0.32
-# Largest number of decades of an axis, and the distance of the places beyond its ends, in decades.
-_DECADES, _ROOM = 6, 0.6
+# Margin of a row, inches.
+_FREE = 0.075
+# Distance of the places beyond the ends of an axis, in decades.
+_ROOM = 0.6
 
 
 @dataclass(frozen=True)
@@ -203,7 +189,7 @@ class LogAxis:
         seen = values[np.isfinite(values) & (values >= 10.0**least)]
         smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (10.0**least, 10.0**least)
         low = int(np.floor(np.log10(smallest)))
-        high = min(max(int(np.ceil(np.log10(largest))), low + 1), low + _DECADES)
+        high = min(max(int(np.ceil(np.log10(largest))), low + 1), low + 6)
         return cls(least, low, high, largest > 10.0**high, bool(np.isinf(values).any()))
 
     @property
@@ -237,12 +223,12 @@ class LogAxis:
     def names(self, width: float) -> dict[float, str]:
         """Labels by place along a panel of this width, inches; labels do not overlap."""
         decade = width / (self.ends[1] - self.ends[0])
-        name, step = (_decade, 1) if decade > _APART else (_power, 2)
+        name, step = (_decade, 1) if decade > 0.5 else (_power, 2)
         beyond = {self.nothing: f"<{name(self.least)}"}
         beyond |= {self.most: f">{name(self.high)}"} if self.exceeded else {}
         beyond |= {self.none: "none"} if self.endless else {}
         decades = range(self.low + step - 1, self.high + 1, step)
-        return beyond | {float(k): name(k) for k in decades if all(abs(k - x) * decade > _NEAR for x in beyond)}
+        return beyond | {float(k): name(k) for k in decades if all(abs(k - x) * decade > 0.32 for x in beyond)}
 
 
 def _as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
@@ -253,7 +239,7 @@ def _as_marks(looks: Looks) -> dict[str, dict[str, Any]]:
 
 def _row_height(n_methods: int) -> float:
     """Height of a row, inches."""
-    return max(_LEAST, _METHOD * n_methods + _FREE)
+    return max(0.24, 0.044 * n_methods + _FREE)
 
 
 def _draw_rows(

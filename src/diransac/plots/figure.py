@@ -23,6 +23,7 @@ __all__ = [
     "COLOURS",
     "DASHES",
     "INK",
+    "LINE",
     "MUTED",
     "PAPER",
     "REFERENCE",
@@ -37,7 +38,7 @@ __all__ = [
     "empty_figure",
     "extent",
     "flight_panels",
-    "header_height",
+    "headed_figure",
     "inches",
     "name_panel",
     "panel",
@@ -45,6 +46,7 @@ __all__ = [
     "svg",
     "write",
     "write_at",
+    "write_caption",
 ]
 
 Range = tuple[float, float]
@@ -68,11 +70,11 @@ def extent(visible: Range) -> float:
 WIDTH = 9.0
 """Width of every figure, inches."""
 
-# Inches: height of a row; margins of a panel for values on the left, its name above, and times below the last one.
-_ROW, _VALUES, _NAME, _TIMES, _GAP, _EDGE = 1.12, 0.46, 0.25, 0.24, 0.06, 0.17
-# Largest width and rows of a path beside the states; aspect ratio above which, and height with which, it is above them.
-_PATH_WIDTH, _PATH_ROWS, _WIDE, _PATH_HEIGHT = 3.75, 3, 2.2, 2.3
-_STEPS = (1, 2, 5, 10)
+# Free height between panels, inches.
+_GAP = 0.06
+
+LINE = 0.155
+"""Height of a line of a caption, inches."""
 
 
 def empty_figure(height: float) -> Figure:
@@ -88,36 +90,42 @@ def empty_figure(height: float) -> Figure:
 
 
 def flight_panels(
-    states: Sequence[str], inputs: Sequence[str], box: tuple[Range, Range] | None, header: float
+    states: Sequence[str],
+    inputs: Sequence[str],
+    box: tuple[Range, Range] | None,
+    entries: Sequence[LegendEntry],
+    title: str | None,
 ) -> tuple[Figure, dict[str, Axes], Axes | None]:
-    """Empty figure, a panel per signal, and a panel for the path: beside the states, or above them if it is wide.
+    """Figure with a heading, a panel per signal, and one for the path: beside the states, or above them if it is wide.
 
     Parameters
     ----------
     box : ranges of the path in x and z; None for no path
-    header : free height at the top, inches
+    entries, title : as in `headed_figure`
     """
+    row_height, times = 1.12, 0.24  # inches: a row of panels, and the times below the last one
+    path_width, path_height = 3.75, 2.3  # inches: beside the states, and above them
     columns = _halves(states)
     n_rows, n_input_rows = max(map(len, columns)), -(-len(inputs) // 2)
-    wide = box is not None and extent(box[0]) > _WIDE * extent(box[1])
-    top = header + (_PATH_HEIGHT + _TIMES if wide else 0.0)
-    below = top + n_rows * _ROW + _TIMES
-    figure = empty_figure(below + n_input_rows * _ROW + _TIMES + _GAP)
+    wide = box is not None and extent(box[0]) > 2.2 * extent(box[1])
+    above = path_height + times if wide else 0.0
+    figure, header = headed_figure(entries, title, above + (n_rows + n_input_rows) * row_height + 2.0 * times + _GAP)
+    top, below = header + above, header + above + n_rows * row_height + times
 
     path = None
     if box is not None:
-        rows = min(n_rows, _PATH_ROWS)
-        path = panel(figure, 0.0, header, *((WIDTH, _PATH_HEIGHT) if wide else (_PATH_WIDTH, rows * _ROW)))
-    left = _PATH_WIDTH if box is not None and not wide else 0.0
+        size = (WIDTH, path_height) if wide else (path_width, min(n_rows, 3) * row_height)
+        path = panel(figure, 0.0, header, *size)
+    left = path_width if box is not None and not wide else 0.0
     width = (WIDTH - left) / 2.0
     panels = {}
     for column, names in enumerate(columns):
         for row, name in enumerate(names):
-            place = (left + column * width, top + row * _ROW, width, _ROW)
+            place = (left + column * width, top + row * row_height, width, row_height)
             panels[name] = panel(figure, *place, last=row == len(names) - 1)
     for i, name in enumerate(inputs):
         alone = i == len(inputs) - 1 and i % 2 == 0
-        place = (i % 2 * WIDTH / 2.0, below + i // 2 * _ROW, WIDTH if alone else WIDTH / 2.0, _ROW)
+        place = (i % 2 * WIDTH / 2.0, below + i // 2 * row_height, WIDTH if alone else WIDTH / 2.0, row_height)
         panels[name] = panel(figure, *place, last=i >= len(inputs) - 2)
     return figure, panels, path
 
@@ -148,11 +156,12 @@ def panel(figure: Figure, left: float, top: float, width: float, height: float, 
     """Panel in a rectangle, inches from the figure's top left; only the last of a column has time labels."""
     from matplotlib.ticker import MaxNLocator
 
-    inner_width, inner_height = width - _VALUES - _EDGE, height - _NAME - _GAP
-    axes = axes_at(figure, left + _VALUES, top + _NAME, inner_width, inner_height)
+    values, name, edge = 0.46, 0.25, 0.17  # inches: values on the left, name above, and the right margin
+    inner_width, inner_height = width - values - edge, height - name - _GAP
+    axes = axes_at(figure, left + values, top + name, inner_width, inner_height)
     axes.tick_params(labelbottom=last)
-    axes.yaxis.set_major_locator(MaxNLocator(max(4, round(1.7 * inner_height)), steps=_STEPS))
-    axes.xaxis.set_major_locator(MaxNLocator(max(4, round(2.2 * inner_width)), steps=_STEPS))
+    axes.yaxis.set_major_locator(MaxNLocator(max(4, round(1.7 * inner_height)), steps=(1, 2, 5, 10)))
+    axes.xaxis.set_major_locator(MaxNLocator(max(4, round(2.2 * inner_width)), steps=(1, 2, 5, 10)))
     return axes
 
 
@@ -160,6 +169,12 @@ def write_at(figure: Figure, x: float, top: float, text: str, **look: Any) -> No
     """Write a text at a place, inches from the figure's top left."""
     at: dict[str, Any] = {"fontsize": 7.5, "color": MUTED, "va": "top"}
     figure.text(x / WIDTH, 1.0 - top / figure.get_figheight(), text, **(at | look))
+
+
+def write_caption(figure: Figure, top: float, lines: Sequence[str]) -> None:
+    """Write the lines of a caption below this height, inches from the figure's top."""
+    for k, line in enumerate(lines):
+        write_at(figure, 0.1, top + k * LINE, line)
 
 
 def round_step(least: float) -> float:
@@ -181,8 +196,8 @@ def inches(axes: Axes) -> tuple[float, float]:
 
 # Heading -------------------------------------------------------------------------------------------------------------
 
-# Inches: height of the title and of a line of the legend, margin around them.
-_TITLE, _LEGEND_LINE, _MARGIN = 0.27, 0.19, 0.16
+# Inches: margin around title and legend.
+_MARGIN = 0.16
 
 LegendEntry = tuple[str, dict[str, Any]]
 """Label, and style of its line."""
@@ -195,19 +210,22 @@ def _columns(entries: Sequence[LegendEntry]) -> int:
     return len(entries) if sum(widths) < WIDTH - 0.2 else max(1, int((WIDTH - 0.2) / max(widths)))
 
 
-def header_height(entries: Sequence[LegendEntry], title: str | None) -> float:
-    """Height of title and legend, inches."""
+def headed_figure(entries: Sequence[LegendEntry], title: str | None, height: float) -> tuple[Figure, float]:
+    """Figure with a title, a legend and a free height below them, inches; and the height above that."""
     lines = -(-len(entries) // _columns(entries))
-    return _MARGIN + _LEGEND_LINE * lines + _title_height(title)
+    header = _MARGIN + 0.19 * lines + _title_height(title)
+    figure = empty_figure(header + height)
+    draw_heading(figure, entries, title)
+    return figure, header
 
 
 def _title_height(title: str | None) -> float:
     """Height of the title, inches."""
-    return _TITLE * len(title.splitlines()) if title else 0.0
+    return 0.27 * len(title.splitlines()) if title else 0.0
 
 
 def draw_heading(figure: Figure, entries: Sequence[LegendEntry], title: str | None) -> None:
-    """Draw title and legend at the top of a figure, in a height of `header_height`."""
+    """Draw title and legend at the top of a figure, as `headed_figure` does."""
     from matplotlib.lines import Line2D
 
     inch = 1.0 / figure.get_figheight()

@@ -14,9 +14,7 @@ from diransac.plots.figure import (
     WIDTH,
     LegendEntry,
     check_ending,
-    draw_heading,
-    empty_figure,
-    header_height,
+    headed_figure,
     name_panel,
     panel,
     write,
@@ -28,8 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["plot_fleet"]
-
-_ROW = 1.9
 
 
 def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -60,13 +56,12 @@ def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: 
     text = f"{summary.rows.model}: {summary.n_vehicles} vehicles" if title is None else title
     entries: list[LegendEntry] = [("fleet", {"color": REFERENCE, "marker": ".", "linestyle": ""})]
     entries += [(vehicle, {"color": colour, "marker": "."}) for vehicle, colour in colours.items()]
-    header = header_height(entries, text)
-    figure = empty_figure(header + _ROW * len(summary.parameters) + 0.35)
-    draw_heading(figure, entries, text)
+    row = 1.9  # inches
+    figure, header = headed_figure(entries, text, row * len(summary.parameters) + 0.35)
     for k, parameter in enumerate(summary.parameters):
-        last, top = k == len(summary.parameters) - 1, header + k * _ROW
-        over_life = panel(figure, 0.0, top, 0.55 * WIDTH, _ROW, last=last)
-        by_vehicle = panel(figure, 0.55 * WIDTH, top, 0.45 * WIDTH, _ROW, last=last)
+        last, top = k == len(summary.parameters) - 1, header + k * row
+        over_life = panel(figure, 0.0, top, 0.55 * WIDTH, row, last=last)
+        by_vehicle = panel(figure, 0.55 * WIDTH, top, 0.45 * WIDTH, row, last=last)
         name_panel(over_life, parameter.name, parameter.unit)
         name_panel(by_vehicle, f"{parameter.name} by vehicle", parameter.unit)
         _draw_lives(over_life, summary, parameter, colours)
@@ -91,17 +86,10 @@ def _draw_lives(axes: Axes, summary: FleetSummary, parameter: ParameterInFleet, 
     begins = np.flatnonzero(np.r_[True, vehicles[1:] != vehicles[:-1]])
     place = np.arange(len(y)) - np.repeat(begins, np.diff(np.r_[begins, len(y)])) + 1
     axes.plot(place, y, ".", color=REFERENCE, markersize=3, rasterized=True)
+    bars = 2.0 * summary.rows.standard_errors[parameter.name]
     for vehicle, colour in colours.items():
         own = vehicles == vehicle
-        axes.errorbar(
-            place[own],
-            y[own],
-            yerr=2.0 * summary.rows.standard_errors[parameter.name][own],
-            color=colour,
-            marker=".",
-            linewidth=0.9,
-            markersize=4,
-        )
+        axes.errorbar(place[own], y[own], bars[own], color=colour, marker=".", linewidth=0.9, markersize=4)
     named = y[np.isin(vehicles, list(colours))]
     low, high = np.nanquantile(y, [0.005, 0.995])
     low, high = min(low, *named[np.isfinite(named)], high), max(high, *named[np.isfinite(named)], low)
@@ -113,23 +101,13 @@ def _draw_lives(axes: Axes, summary: FleetSummary, parameter: ParameterInFleet, 
 def _draw_vehicles(axes: Axes, parameter: ParameterInFleet, colours: dict[str, str]) -> None:
     """Value of each vehicle at its beginning, with two standard errors."""
     order = np.argsort(parameter.values)
-    axes.axhspan(
-        parameter.mean - 2.0 * parameter.between, parameter.mean + 2.0 * parameter.between, color=REFERENCE, alpha=0.25
-    )
-    axes.axhline(parameter.mean, color=REFERENCE, linewidth=0.9)
-    shown = np.arange(len(order)) + 1
-    axes.vlines(
-        shown,
-        (parameter.values - 2.0 * parameter.standard_errors)[order],
-        (parameter.values + 2.0 * parameter.standard_errors)[order],
-        color=REFERENCE,
-        linewidth=0.8,
-        rasterized=True,
-    )
-    axes.plot(shown, parameter.values[order], ".", color=REFERENCE, markersize=3, rasterized=True)
-    for k, i in zip(shown, order, strict=True):
+    mean, spread = parameter.mean, 2.0 * parameter.between
+    axes.axhspan(mean - spread, mean + spread, color=REFERENCE, alpha=0.25)
+    axes.axhline(mean, color=REFERENCE, linewidth=0.9)
+    place, y, bars = np.arange(len(order)) + 1, parameter.values[order], 2.0 * parameter.standard_errors[order]
+    axes.vlines(place, y - bars, y + bars, color=REFERENCE, linewidth=0.8, rasterized=True)
+    axes.plot(place, y, ".", color=REFERENCE, markersize=3, rasterized=True)
+    for k, i in enumerate(order):
         colour = colours.get(parameter.vehicles[i])
         if colour is not None:
-            axes.errorbar(
-                k, parameter.values[i], yerr=2.0 * parameter.standard_errors[i], color=colour, marker=".", markersize=5
-            )
+            axes.errorbar(place[k], y[k], bars[k], color=colour, marker=".", markersize=5)

@@ -23,10 +23,8 @@ from diransac.plots.figure import (
     LegendEntry,
     Range,
     check_ending,
-    draw_heading,
     extent,
     flight_panels,
-    header_height,
     inches,
     name_panel,
     round_step,
@@ -84,14 +82,13 @@ def plot_flight(
     flights = _flights(trajectory, log)
     states, inputs = flights[0].reference.state_names, flights[0].reference.input_names
     entries, box = _legend_entries(flights), _path_box(flights)
-    figure, panels, path_panel = flight_panels(states, inputs, box, header_height(entries, title))
+    figure, panels, path_panel = flight_panels(states, inputs, box, entries, title)
     for name in states:
         _draw_signal(panels[name], name, flights)
     for name in inputs:
         _draw_signal(panels[name], name, flights, drawstyle="steps-post")
     if path_panel is not None and box is not None:
         _draw_path(path_panel, flights, box)
-    draw_heading(figure, entries, title)
     return write(figure, path)
 
 
@@ -112,10 +109,6 @@ def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
     if any(_last_finite(f.log[name]) is not None for f in flights for name in seen):
         entries.append(("last finite value", {"marker": "X", **marks}))
     return entries
-
-
-# Of the range of an axis: margin, and distance up to which a line is drawn; least aspect ratio of a path.
-_MARGIN, _FARTHEST, _LEAST_BREADTH = 0.06, 20.0, 0.15
 
 
 @dataclass(frozen=True)
@@ -184,7 +177,7 @@ def _visible(name: str, flights: Sequence[FlightCurve]) -> Range:
     width = high - low
     if not width > 1e-9 * max(abs(low), abs(high)):
         width = max(abs(low), abs(high), 1.0)
-    return low - _MARGIN * width, high + _MARGIN * width
+    return low - 0.06 * width, high + 0.06 * width
 
 
 def _reach(planned: FloatArray, flown: Sequence[FloatArray]) -> float:
@@ -206,13 +199,13 @@ def _path_box(flights: Sequence[FlightCurve]) -> tuple[Range, Range] | None:
     if not {"x", "z"} <= set(flights[0].reference.state_names):
         return None
     x, z = _visible("x", flights), _visible("z", flights)
-    least = _LEAST_BREADTH * max(extent(x), extent(z))
+    least = 0.15 * max(extent(x), extent(z))
     return _around(x, max(extent(x), least)), _around(z, max(extent(z), least))
 
 
 def _near(values: FloatArray, visible: Range) -> FloatArray:
     """Values clipped far outside of the range, which a canvas cannot draw."""
-    reach = _FARTHEST * extent(visible)
+    reach = 20.0 * extent(visible)
     return np.asarray(np.clip(values, visible[0] - reach, visible[1] + reach))
 
 
@@ -352,10 +345,6 @@ def _mark_start(axes: Axes, reference: Trajectory, box: tuple[Range, Range]) -> 
 
 
 # Simulations beside measurements -------------------------------------------------------------------------------------
-_MEASURED: dict[str, Any] = {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5}
-_SIMULATED: dict[str, Any] = {"color": COLOURS[0], "linewidth": 1.3}
-
-
 def plot_prediction(
     simulated: Log, measured: Log, states: Sequence[str], inputs: Sequence[str], path: str | Path | None = None
 ) -> Figure:
@@ -378,18 +367,20 @@ def plot_prediction(
         The ending is unknown, or the file cannot be written.
     """
     check_ending(path)
-    entries = [("simulated", _SIMULATED), ("measured", _MEASURED)]
-    figure, panels, _ = flight_panels(states, inputs, None, header_height(entries, None))
-    draw_heading(figure, entries, None)
+    looks: dict[str, dict[str, Any]] = {
+        "simulated": {"color": COLOURS[0], "linewidth": 1.3},
+        "measured": {"color": REFERENCE, "linestyle": "none", "marker": ".", "markersize": 2.5},
+    }
+    figure, panels, _ = flight_panels(states, inputs, None, list(looks.items()), None)
     for name, axes in panels.items():
         name_panel(axes, name, simulated.units.get(name, ""))
         if name in inputs:
             axes.plot(simulated.time, simulated[name], color=MUTED, linewidth=1.0)
             continue
-        axes.plot(simulated.time, simulated[name], zorder=3, **_SIMULATED)
+        axes.plot(simulated.time, simulated[name], zorder=3, **looks["simulated"])
         low, high = float(np.nanmin(simulated[name])), float(np.nanmax(simulated[name]))
         if name in measured:
-            axes.plot(measured.time, measured[name], zorder=2, **_MEASURED)
+            axes.plot(measured.time, measured[name], zorder=2, **looks["measured"])
             finite = _finite(measured[name])
             if len(finite):
                 bulk = np.quantile(finite, [0.01, 0.99])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,8 @@ from diransac.plots.figure import (
     Range,
     axes_at,
     check_ending,
-    draw_heading,
-    empty_figure,
     extent,
-    header_height,
+    headed_figure,
     round_step,
     write,
     write_at,
@@ -40,11 +38,6 @@ __all__ = ["levels_with_paths", "plot_paths"]
 Path2 = npt.NDArray[np.float32]
 _Paths = Mapping[str, Mapping[str, list[Path2]]]
 
-# Inches: left of the panels, between them, above a row (trajectory's name), below it (counts), the caption.
-_LEFT, _GAP, _NAME, _BELOW, _CAPTION = 0.42, 0.12, 0.24, 0.42, 0.3
-# Margin around the reference as a fraction of its larger side; every n-th row of paths is drawn.
-_MARGIN, _EVERY = 0.3, 3
-_PALE = 0.35
 _DASHES = (0.0, (4.0, 3.0))
 
 
@@ -124,19 +117,19 @@ def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: 
     entries = [("flown with the true parameters", looks[TRUE])] if TRUE in looks else []
     if any(some for by_method in planned.values() for some in by_method.values()):
         entries.append(("reference of the method", {"color": INK, "linestyle": _DASHES, "linewidth": 0.8}))
-    width = (WIDTH - _LEFT - 0.1) / len(looks) - _GAP
+    # Inches: left of the panels, between them, above a row (trajectory's name), below it (counts), the caption.
+    margin, gap, above, under, foot = 0.42, 0.12, 0.24, 0.42, 0.3
+    width = (WIDTH - margin - 0.1) / len(looks) - gap
     boxes = {shape: _box(by_method) for shape, by_method in flown.items()}
     heights = {shape: width * extent(box[1]) / extent(box[0]) for shape, box in boxes.items()}
-    header = header_height(entries, title)
-    full = header + sum(_NAME + height + _BELOW for height in heights.values()) + _CAPTION
-    figure = empty_figure(full)
-    top = header
+    figure, top = headed_figure(entries, title, sum(above + height + under for height in heights.values()) + foot)
     for shape, by_method in flown.items():
         write_at(figure, 0.1, top + 0.03, shape, fontsize=9.5, color=INK)
         counts = _counts(summary, shape, level)
+        below = top + above + heights[shape]
         for k, (label, look) in enumerate(looks.items()):
-            left, below = _LEFT + k * (width + _GAP), top + _NAME + heights[shape]
-            axes = axes_at(figure, left, top + _NAME, width, heights[shape])
+            left = margin + k * (width + gap)
+            axes = axes_at(figure, left, top + above, width, heights[shape])
             _draw_flights(axes, by_method[label], by_method.get(TRUE, []), look["color"], label == TRUE)
             _draw_references(axes, planned[shape][label])
             axes.set(xlim=boxes[shape][0], ylim=boxes[shape][1])
@@ -146,11 +139,10 @@ def _drawn(summary: Summary, level: str, flown: _Paths, planned: _Paths, title: 
             write_at(figure, left + width, top + 0.06, label, fontsize=8, color=look["color"], ha="right")
             unseen = _unseen(by_method[label], boxes[shape], *counts[label])
             write_at(figure, left + width, below + 0.17, unseen, fontsize=7, ha="right")
-        top += _NAME + heights[shape] + _BELOW
-    draw_heading(figure, entries, title)
+        top = below + under
     caption = f"Every trial's path in the XZ plane, m; {summary.axis} {level} {summary.unit}".rstrip()
     caption += f". {summary.remark}" if summary.remark else ""
-    write_at(figure, 0.1, full - _CAPTION + 0.06, caption)
+    write_at(figure, 0.1, top + 0.06, caption)
     return figure
 
 
@@ -159,31 +151,33 @@ def _box(by_method: Mapping[str, list[Path2]]) -> tuple[Range, Range]:
     every = by_method.get(TRUE) or [path for some in by_method.values() for path in some]
     low = np.median([path[:, :2].min(axis=0) for path in every], axis=0)
     high = np.median([path[:, :2].max(axis=0) for path in every], axis=0)
-    margin = _MARGIN * max(float((high - low).max()), 1e-6)
+    margin = 0.3 * max(float((high - low).max()), 1e-6)
     return tuple((float(a) - margin, float(b) + margin) for a, b in zip(low, high, strict=True))  # type: ignore[return-value]
 
 
 def _draw_flights(axes: Axes, flown: Sequence[Path2], true: Sequence[Path2], colour: str, is_true: bool) -> None:
-    from matplotlib.collections import LineCollection
-
     for reference in true[:1]:
-        axes.plot(*reference[::_EVERY, :2].T, color=REFERENCE, linewidth=2.6, solid_capstyle="round", zorder=1.8)
+        axes.plot(*_thinned(reference).T, color=REFERENCE, linewidth=2.6, solid_capstyle="round", zorder=1.8)
     if not is_true:
-        lines = [path[::_EVERY, :2] for path in flown]
-        axes.add_collection(
-            LineCollection(lines, colors=colour, linewidths=0.6, alpha=_PALE, zorder=2.5), autolim=False
-        )
+        _draw_lines(axes, flown, colors=colour, linewidths=0.6, zorder=2.5)
 
 
 def _draw_references(axes: Axes, planned: Sequence[Path2]) -> None:
     """Draw planned paths, equal ones once."""
+    different = list({path.tobytes(): path for path in planned}.values())
+    _draw_lines(axes, different, colors=INK, linewidths=0.5, linestyles=[_DASHES], zorder=2.7)
+
+
+def _draw_lines(axes: Axes, paths: Sequence[Path2], **look: Any) -> None:
+    """Draw pale lines."""
     from matplotlib.collections import LineCollection
 
-    lines = [path[::_EVERY, :2] for path in {path.tobytes(): path for path in planned}.values()]
-    axes.add_collection(
-        LineCollection(lines, colors=INK, linewidths=0.5, linestyles=[_DASHES], alpha=_PALE, zorder=2.7),
-        autolim=False,
-    )
+    axes.add_collection(LineCollection([_thinned(path) for path in paths], alpha=0.35, **look), autolim=False)
+
+
+def _thinned(path: Path2) -> Path2:
+    """Every third place of a path in x and z."""
+    return path[::3, :2]
 
 
 # Text ----------------------------------------------------------------------------------------------------------------

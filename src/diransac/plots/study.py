@@ -16,19 +16,19 @@ from diransac.plain_text import printable
 from diransac.plots.figure import (
     COLOURS,
     INK,
+    LINE,
     PAPER,
     REFERENCE,
     SOFT,
     WIDTH,
     axes_at,
     check_ending,
-    draw_heading,
-    empty_figure,
-    header_height,
+    headed_figure,
     name_panel,
     panel,
     write,
     write_at,
+    write_caption,
 )
 from diransac.study.method_choice import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
@@ -41,23 +41,9 @@ if TYPE_CHECKING:
 __all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study", "title_of"]
 
 
-# Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a line of the caption.
-_ROW, _NAME, _AXIS, _LINE = 1.5, 0.24, 0.36, 0.155
+# Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a row of failures.
+_ROW, _NAME, _AXIS, _CELL = 1.5, 0.24, 0.36, 0.19
 _COLUMNS = 3
-# Width of a letter of a level's name, inches.
-_LETTER = 0.06
-# Letters per line of a title, and largest difference between its lines.
-_LETTERS, _RAGGED = 92, 12
-
-# The fifth colour is too close to the first where lines cross.
-_COLOURS = (*COLOURS[:4], INK, COLOURS[5], "#d55e00")
-_MARKERS = ("o", "s", "^", "v", "D", "P", "X")
-_CAPTION = (
-    "Mean of the RMS tracking error and one standard deviation, over {trials}; a dash is the median, for which "
-    "a failed trial",
-    "has an infinite error. A trial without a flight (no plan, or one that diverged) has failed: means exclude it, and "
-    "are then hollow.",
-)
 
 
 def plot_study(store: str | Path, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -102,23 +88,25 @@ def plot_study(store: str | Path, path: str | Path | None = None, *, title: str 
 
 
 def _drawn(summary: Summary, title: str) -> Figure:
-    looks = method_looks(summary.methods)
-    header = header_height(list(looks.items()), title)
-    words = [line.format(trials=n_trials(summary)) for line in (*_CAPTION, summary.remark) if line]
-    names = 0.0 if summary.is_numeric else _LETTER * max(map(len, summary.levels))
+    caption = [
+        f"Mean of the RMS tracking error and one standard deviation, over {n_trials(summary)}; a dash is the median, "
+        "for which a failed trial",
+        "has an infinite error. A trial without a flight (no plan, or one that diverged) has failed: means exclude it, "
+        "and are then hollow.",
+        *filter(None, [summary.remark]),
+    ]
+    names = 0.0 if summary.is_numeric else 0.06 * max(map(len, summary.levels))
     n_rows = -(-len(summary.units) // _COLUMNS)
     heights = {
-        shape: _NAME + n_rows * _ROW + _AXIS + _HEADING + 2.0 * names + _CELL * len(_failing(flights.failure_share))
+        shape: _NAME + n_rows * _ROW + _AXIS + 0.31 + 2.0 * names + _CELL * len(_failing(flights.failure_share))
         for shape, flights in summary.flights.items()
     }
-    figure = empty_figure(header + sum(heights.values()) + _LINE * len(words) + 0.14)
-    top = header
+    entries = list(method_looks(summary.methods).items())
+    figure, top = headed_figure(entries, title, sum(heights.values()) + LINE * len(caption) + 0.14)
     for shape, flights in summary.flights.items():
         _draw_block(figure, summary, shape, flights, top, names)
         top += heights[shape]
-    draw_heading(figure, list(looks.items()), title)
-    for row, line in enumerate(words):
-        write_at(figure, 0.1, top + 0.1 + row * _LINE, line)
+    write_caption(figure, top + 0.1, caption)
     return figure
 
 
@@ -242,17 +230,20 @@ def _tick(y: float) -> str:
 def title_of(summary: Summary) -> str:
     """Name and description of the study, wrapped."""
     text = f"{summary.name}: {summary.description}".removesuffix(": ")
-    n_lines = -(-len(text) // _LETTERS)
-    return "\n".join(wrap(text, min(_LETTERS, len(text) // n_lines + _RAGGED)))
+    most = 92  # letters per line
+    n_lines = -(-len(text) // most)
+    return "\n".join(wrap(text, min(most, len(text) // n_lines + 12)))
 
 
 def method_looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Style of each method's line: its own colour and mark; broad and grey for the true parameters."""
+    # The fifth colour is too close to the first where lines cross.
+    colours, markers = (*COLOURS[:4], INK, COLOURS[5], "#d55e00"), ("o", "s", "^", "v", "D", "P", "X")
     others = [label for label in methods if label != TRUE]
     looks: dict[str, dict[str, Any]] = {TRUE: {"color": REFERENCE, "linewidth": 2.8, "solid_capstyle": "round"}}
     for i, label in enumerate(others):
-        mark = {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 4.0}
-        looks[label] = {"color": _COLOURS[i % len(_COLOURS)], "linewidth": 0.9, **mark}
+        mark = {"marker": markers[i % len(markers)], "markersize": 4.0}
+        looks[label] = {"color": colours[i % len(colours)], "linewidth": 0.9, **mark}
     return {label: looks[label] for label in methods}
 
 
@@ -279,9 +270,6 @@ def n_trials(summary: Summary) -> str:
 
 # Failed trials -------------------------------------------------------------------------------------------------------
 
-# Inches: height of a row of cells, of the heading; left end and width of the cells.
-_CELL, _HEADING, _LEFT, _WIDTH = 0.19, 0.31, 1.75, 7.08
-
 
 def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArray, names: float) -> None:
     """Draw a table of the fraction of trials without a flight, by method and level, the darker the more there are.
@@ -297,7 +285,7 @@ def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArr
         write_at(figure, 0.1, top + 0.05, "No trial failed.", color=INK)
         return
     write_at(figure, 0.1, top + 0.05, "Trials that failed, %", color=INK)
-    axes = axes_at(figure, _LEFT, top + 0.21 + names, _WIDTH, _CELL * len(failing))
+    axes = axes_at(figure, 1.75, top + 0.21 + names, 7.08, _CELL * len(failing))
     shown = np.nan_to_num(share[:, failing].T)
     edges = [np.arange(n + 1) - 0.5 for n in shown.T.shape]
     axes.pcolormesh(*edges, np.where(shown > 0.0, 0.12 + 0.6 * shown, 0.0), cmap=_failure_colours(), vmin=0.0, vmax=1.0,

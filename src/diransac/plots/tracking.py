@@ -16,9 +16,7 @@ from diransac.plots.figure import (
     WIDTH,
     LegendEntry,
     check_ending,
-    draw_heading,
-    empty_figure,
-    header_height,
+    headed_figure,
     name_panel,
     panel,
     write,
@@ -28,20 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_tracking"]
+__all__ = ["INTERVAL", "plot_tracking", "usual_range"]
 
-_ROW, _FOOT = 1.5, 0.45
-# Room for values with many digits, inches: a parameter moves in its last ones.
-_DIGITS = 0.3
-# More points than a panel has pixels.
-_POINTS = 2000
-# Half the width of a 95 % interval, in standard errors.
-_INTERVAL = 1.96
+INTERVAL = 1.96
+"""Half the width of a 95 % interval, in standard errors."""
 _CHANGE: dict[str, Any] = {"color": COLOURS[2], "linewidth": 1.0, "linestyle": (0.0, DASHES[2])}
-# Part of the values that may be outside of a panel, as those of the first seconds are, and the free part beyond.
-_TAIL, _MARGIN = 0.02, 0.15
-# Room for the legend of outliers, over their range.
-_LEGEND = 0.5
 
 
 def plot_tracking(history: History, path: str | Path | None = None, *, title: str | None = None) -> Figure:
@@ -70,14 +59,11 @@ def plot_tracking(history: History, path: str | Path | None = None, *, title: st
     signals = history.signals
     text = history.model.name if title is None else title
     entries: list[LegendEntry] = [("estimate, 95 % interval", {"color": COLOURS[0]}), ("change", _CHANGE)]
-    header = header_height(entries, text)
     n_rows = len(history.model.parameters) + bool(signals)
-    figure = empty_figure(header + _ROW * n_rows + _FOOT)
-    draw_heading(figure, entries, text)
-    shown = slice(None, None, -(-len(history.time) // _POINTS))
-    panels = [
-        panel(figure, _DIGITS, header + k * _ROW, WIDTH - _DIGITS, _ROW, last=k == n_rows - 1) for k in range(n_rows)
-    ]
+    row, digits = 1.5, 0.3  # inches: room for values with many digits, as a parameter moves in its last ones
+    figure, header = headed_figure(entries, text, row * n_rows + 0.45)
+    shown = slice(None, None, -(-len(history.time) // 2000))  # more points than a panel has pixels
+    panels = [panel(figure, digits, header + k * row, WIDTH - digits, row, last=k == n_rows - 1) for k in range(n_rows)]
     for axes, (name, parameter) in zip(panels, history.model.parameters.items(), strict=False):
         name_panel(axes, name, parameter.unit)
         _draw_parameter(axes, history, name, shown)
@@ -91,26 +77,32 @@ def plot_tracking(history: History, path: str | Path | None = None, *, title: st
 def _draw_parameter(axes: Axes, history: History, name: str, shown: slice) -> None:
     """Estimates with their intervals, and changes."""
     t, y = history.time[shown], history.values(name)[shown]
-    half = _INTERVAL * history.standard_errors(name)[shown]
+    half = INTERVAL * history.standard_errors(name)[shown]
     axes.fill_between(t, y - half, y + half, color=COLOURS[0], alpha=0.2, linewidth=0.0)
     axes.plot(t, y, color=COLOURS[0], linewidth=1.1)
     for change in history.changes:
         if change.parameter == name:
             axes.axvline(change.time, **_CHANGE)
     axes.set_xlim(float(t.min()), float(t.max()) if t.max() > t.min() else float(t.min()) + 1.0)
-    axes.set_ylim(*_range(y, half))
+    low, high = usual_range(y, half)
+    margin = 0.15 * (high - low or abs(high) or 1.0)
+    axes.set_ylim(low - margin, high + margin)
 
 
-def _range(y: FloatArray, half: FloatArray) -> tuple[float, float]:
-    """Range of most values and of the usual interval."""
+def usual_range(y: FloatArray, half: FloatArray) -> tuple[float, float]:
+    """Range of most values of a parameter (n,), without those of the first seconds, and of its usual interval.
+
+    Parameters
+    ----------
+    y : (n,)   estimates over time
+    half : (n,)   half of the width of each interval
+    """
     known = np.isfinite(y)
     if not known.any():
         return 0.0, 1.0
     usual = float(np.median(half[known & np.isfinite(half)])) if (known & np.isfinite(half)).any() else 0.0
-    low, high = np.quantile(y[known], [_TAIL, 1.0 - _TAIL])
-    low, high = float(low) - usual, float(high) + usual
-    margin = _MARGIN * (high - low or abs(high) or 1.0)
-    return low - margin, high + margin
+    low, high = np.quantile(y[known], [0.02, 0.98])
+    return float(low) - usual, float(high) + usual
 
 
 def _draw_outliers(axes: Axes, history: History, shown: slice) -> None:
@@ -119,6 +111,6 @@ def _draw_outliers(axes: Axes, history: History, shown: slice) -> None:
         dashes = DASHES[k // len(COLOURS) % len(DASHES)]
         style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": (0.0, dashes) if dashes else "-"}
         axes.plot(history.time[shown], history.outliers(name)[shown], linewidth=0.9, label=name, **style)
-    axes.set_ylim(0.0, (1.0 + _LEGEND) * axes.get_ylim()[1])
+    axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])  # with room for the legend
     axes.set_xlim(*axes.figure.axes[0].get_xlim())
     axes.legend(fontsize=6.5, ncols=5, frameon=False, loc="upper left", labelcolor=INK)

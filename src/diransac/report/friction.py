@@ -17,8 +17,6 @@ from diransac.text_table import number, percent
 
 __all__ = ["friction_figures"]
 
-_KINDS = ("damping", "friction", "stribeck")
-_CELLS, _GRID = 400, 1000
 # Part of the samples at either end of the speeds, and of the forces, that may be outside of the figure.
 _TAIL = 0.005
 
@@ -45,7 +43,11 @@ def _friction_parameters(model: Model) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name, parameter in model.parameters.items():
         kind, _, coordinate = name.partition("_")
-        if kind in _KINDS and len(parameter.combination) == 1 and coordinate in model.coordinates:
+        if (
+            kind in ("damping", "friction", "stribeck")
+            and len(parameter.combination) == 1
+            and coordinate in model.coordinates
+        ):
             found.setdefault(coordinate, []).append(name)
     return found
 
@@ -65,7 +67,8 @@ def _figure(title: str, joint: str, names: Sequence[str], result: Result, logs: 
     force = _friction(result, i, names, speed) - error
     low, high = np.quantile(speed, [_TAIL, 1.0 - _TAIL])
     low, high = (float(low), float(high)) if high > low else (-1.0, 1.0)
-    axis = Timeline(_GRID + 1, low, (high - low) / _GRID, _CELLS)
+    n_cells = 1000
+    axis = Timeline(n_cells + 1, low, (high - low) / n_cells, cells=400)
     grid = np.asarray(low + axis.dt * np.arange(axis.n_rows), dtype=float)
     curve = _friction(result, i, names, grid)
     inside = (speed >= low) & (speed <= high)

@@ -17,15 +17,8 @@ from diransac.text_table import number, percent, plural, share
 
 __all__ = ["LogFigures", "figures_of"]
 
-# Cells of the figures: fewer on a page of many results, which keeps it small.
-_CELLS, _FEWEST_CELLS = 500, 110
-_BEYOND_MEASURED = 0.4
-_BEYOND_REFERENCE = 2.0
 _VISIBLE = 0.01
-_MOST = 0.5
-_NOISE = 3.0
 _STRETCHES = 6
-_FORCES = {"m/s^2": "N", "rad/s^2": "N m"}
 
 
 @dataclass(frozen=True)
@@ -59,7 +52,7 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
     runs : every result of the page over this log
     n_logs : number of logs on the page
     """
-    cells = max(_FEWEST_CELLS, _CELLS // (len(runs) * n_logs))
+    cells = max(110, 500 // (len(runs) * n_logs))  # fewer on a page of many results, which keeps it small
     timeline = Timeline(len(log), float(log.time[0]), log.dt, cells)
     marking = max(runs, key=lambda run: run.inlier_fraction)
     names = dict.fromkeys(name for run in runs for name in run.observations.signals)
@@ -173,7 +166,7 @@ def _column(values: FloatArray, run: Run, name: str) -> FloatArray:
 def _signal_scale(name: str, shown: Run, runs: Sequence[Run]) -> Scale:
     """The measured range, widened by simulations up to a limit."""
     low, high = shown.ranges[name]
-    reach = _BEYOND_MEASURED * (high - low)
+    reach = 0.4 * (high - low)
     for run in runs:
         simulated = _column(run.simulated, run, name)
         near = np.clip(simulated[np.isfinite(simulated)], low - reach, high + reach)
@@ -257,7 +250,7 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
         if run is shown:
             traces.append(_dots(f"{run.label} (outlier)", look, run, errors, apart))
         traces.append(_dots(run.label, f"m{i}", run, errors, ~apart))
-        ranges.append(segment.bulk_range(errors[~apart] if np.mean(apart) < _MOST else errors))
+        ranges.append(segment.bulk_range(errors[~apart] if np.mean(apart) < 0.5 else errors))
     level, meaning = _level(name, shown)
     levels = (-level, level) if level > 0.0 else ()
     low, high = shown.ranges[name]
@@ -278,14 +271,14 @@ def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, BoolArray]:
 def _level(name: str, run: Run) -> tuple[float, str]:
     """Reference value of the residuals, 0 without one, and its name."""
     if run.screened:
-        return _NOISE * run.noise.get(name, 0.0), "three standard deviations of the noise"
+        return 3.0 * run.noise.get(name, 0.0), "three standard deviations of the noise"
     return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
 
 
 def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool], visible: float) -> Scale:
     """The marking run's range, widened by the other runs' up to twice its width or to ``visible``."""
     low, high = ranges[is_shown.index(True)]
-    reach = max(_BEYOND_REFERENCE * (high - low), visible)
+    reach = max(2.0 * (high - low), visible)
     lowest, highest = min(a for a, _ in ranges), max(b for _, b in ranges)
     return padded(max(lowest, low - reach), min(highest, high + reach))
 
@@ -319,7 +312,7 @@ def _unmodelled_figure(
     bands: Mapping[str, BoolArray],
 ) -> Figure:
     model = run.result.model
-    unit = _FORCES.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
+    unit = {"m/s^2": "N", "rad/s^2": "N m"}.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
     coordinate = model.rate_names[list(model.accelerations).index(name)]
     what = f"force on {coordinate}" if found.unmodelled_forces else name
     if found.unmodelled_forces and coordinate in model.first_order:

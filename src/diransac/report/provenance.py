@@ -17,9 +17,6 @@ from diransac.text_table import number, percent, plural
 
 __all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "unique_models", "versions"]
 
-_PACKAGES = ("diransac", "numpy", "scipy", "casadi", "llvmlite")
-_HOLD = Resolution().hold
-
 
 def unique_models(entries: Sequence[Entry]) -> list[Model]:
     """The models of the page."""
@@ -66,7 +63,12 @@ def _facts(entry: Entry) -> dict[str, tuple[str, bool]]:
         facts["priors"] = ", ".join(f"{n} = {number(m, 6)} ± {number(s, 2)}" for n, (m, s) in result.priors.items())
     chosen = {key: (_value(x), x != default[key]) for key, x in result.settings.to_dict().items()}
     own = {key: (_value(x), x != defaults.get(key)) for key, x in result.options.items()}
-    return {key: (text, False) for key, text in facts.items()} | chosen | {"input hold": (hold, hold != _HOLD)} | own
+    return (
+        {key: (text, False) for key, text in facts.items()}
+        | chosen
+        | {"input hold": (hold, hold != Resolution().hold)}
+        | own
+    )
 
 
 def _value(x: Any) -> str:
@@ -117,5 +119,5 @@ def versions() -> str:
     """Versions of the packages and the platform."""
     from importlib.metadata import version
 
-    packages = ", ".join(f"{name} {version(name)}" for name in _PACKAGES)
+    packages = ", ".join(f"{name} {version(name)}" for name in ("diransac", "numpy", "scipy", "casadi", "llvmlite"))
     return f"{packages}, Python {platform.python_version()} on {platform.system()} {platform.machine()}"

@@ -33,8 +33,6 @@ __all__ = [
 
 _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
 """Look of each verdict."""
-_WIDEST = 2.0
-_LONG = 6
 
 
 # ---------------------------------------------------------------------- summary
@@ -224,7 +222,7 @@ def _group(name: str, having: Sequence[tuple[int, Entry]]) -> ParameterGroup:
 def _parameter_ticks(scale: Scale) -> list[tuple[float, str]]:
     """Ticks; long ones are fewer, with a margin to the edges."""
     found = ticks(scale.low, scale.high, 4)
-    if max(len(text) for _, text in found) <= _LONG:
+    if max(len(text) for _, text in found) <= 6:
         return found
     margin = 0.1 * (scale.high - scale.low)
     return [x for x in ticks(scale.low, scale.high, 2) if scale.low + margin < x[0] < scale.high - margin]
@@ -241,7 +239,7 @@ def _parameter_scale(name: str, entries: Sequence[Entry]) -> Scale:
     sharpest = int(np.argmin(np.where(widths > 0.0, widths, np.inf)))  # a fixed value has no interval
     core = np.append(estimates, intervals[sharpest][np.isfinite(intervals[sharpest])])
     low, high = float(core.min()), float(core.max())
-    reach = _WIDEST * (high - low)
+    reach = 2.0 * (high - low)
     edges = np.clip(intervals[np.isfinite(intervals)], low - reach, high + reach)
     if high - low <= 1e-9 * abs(high):
         low, high = low - 1e-3 * abs(low), high + 1e-3 * abs(high)

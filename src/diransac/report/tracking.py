@@ -9,23 +9,13 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.tracking.estimates import History
+from diransac.plots.tracking import INTERVAL, usual_range
 from diransac.report import provenance
-from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
+from diransac.report.figures import Figure, Panel, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.rendering import Table, write_page
 from diransac.text_table import number, percent, plural
 
 __all__ = ["write_tracking_report"]
-
-# Rows of the time axis at most; where a gap makes more of them, estimates are numbered instead.
-_MOST_ROWS = 1_000_000
-# Half the width of a 95 % interval, in standard errors.
-_INTERVAL = 1.96
-# Part of the values that may be outside of a figure: those of the first seconds.
-_TAIL = 0.02
-# Width of the mark of a change, as a part of the axis.
-_MARK = 0.006
-# Intervals between estimates, in usual ones, from which on no line joins them.
-_GAP = 1.5
 
 
 def write_tracking_report(history: History, path: str | Path, *, command: str = "") -> None:
@@ -82,22 +72,23 @@ class _Axis:
     def __init__(self, time: FloatArray) -> None:
         steps = np.diff(time)
         dt = float(np.median(steps)) if len(steps) else 1.0
-        self.is_time = bool(len(steps) == 0 or (steps.min() > 0.0 and time[-1] - time[0] < _MOST_ROWS * dt))
+        most_rows = 1_000_000  # where a gap makes more of them, estimates are numbered instead
+        self.is_time = bool(len(steps) == 0 or (steps.min() > 0.0 and time[-1] - time[0] < most_rows * dt))
         start, dt = (float(time[0]), dt) if self.is_time else (0.0, 1.0)
         self.rows: IntArray = np.rint((time - start) / dt).astype(np.int64) if self.is_time else np.arange(len(time))
         self.timeline = Timeline(int(self.rows[-1]) + 1, start, dt)
         self._time = time
 
     def trace(self, name: str, look: str, values: FloatArray) -> Trace:
-        """A line through the estimates, broken at gaps."""
-        gaps = np.flatnonzero(np.diff(self.rows) > _GAP) + 1
+        """A line through the estimates, broken where they are further apart than usual."""
+        gaps = np.flatnonzero(np.diff(self.rows) > 1.5) + 1
         rows = np.insert(self.rows, gaps, self.rows[gaps] - 1)
         return Trace(name, look, "line", rows, np.insert(values.astype(float), gaps, np.nan))
 
     def marked(self, times: Sequence[float]) -> BoolArray:
         """Rows (n_rows,) about some times."""
         n = self.timeline.n_rows
-        marks, half = np.zeros(n, bool), max(1, round(0.5 * _MARK * n))
+        marks, half = np.zeros(n, bool), max(1, round(0.003 * n))
         for t in times:
             row = int(self.rows[np.abs(self._time - t).argmin()])
             marks[max(0, row - half) : row + half] = True
@@ -119,7 +110,7 @@ def _parameters(history: History) -> Table:
     rows = []
     for name, parameter in history.model.parameters.items():
         value, error = history.last.parameters[name], history.last.standard_errors[name]
-        low, high = (number(value + side * _INTERVAL * error) for side in (-1.0, 1.0))
+        low, high = (number(value + side * INTERVAL * error) for side in (-1.0, 1.0))
         y = history.values(name)
         over_run = f"{number(float(y.min()))} to {number(float(y.max()))}"
         rows.append([name, number(value, 5), f"{low} to {high}", over_run, parameter.unit])
@@ -149,7 +140,7 @@ def _changes(history: History) -> Table | None:
 
 def _parameter_figure(history: History, name: str, axis: _Axis) -> Figure:
     """A parameter with its interval, and its changes as bands."""
-    y, half = history.values(name), _INTERVAL * history.standard_errors(name)
+    y, half = history.values(name), INTERVAL * history.standard_errors(name)
     traces = [
         axis.trace("95 % interval, from", "long m0", y - half),
         axis.trace("95 % interval, to", "long m0", y + half),
@@ -159,19 +150,9 @@ def _parameter_figure(history: History, name: str, axis: _Axis) -> Figure:
     bands = {"departed": axis.marked([x.time for x in changes])} if changes else None
     unit = history.model.parameters[name].unit
     label = f"{name} in {unit or '1'} over time, with its 95 % interval"
-    plot = time_plot(traces, _scale(y, half), axis.timeline, label, bands=bands)
+    plot = time_plot(traces, padded(*usual_range(y, half)), axis.timeline, label, bands=bands)
     facts = (plural(len(changes), "change"),) if changes else ()
     return _figure(name, unit, facts, [Panel(plot)], axis)
-
-
-def _scale(y: FloatArray, half: FloatArray) -> Scale:
-    """Range of most values with their usual interval."""
-    known = np.isfinite(y)
-    if not known.any():
-        return padded(0.0, 1.0)
-    usual = float(np.median(np.where(np.isfinite(half), half, 0.0)[known]))
-    low, high = np.quantile(y[known], [_TAIL, 1.0 - _TAIL])
-    return padded(float(low) - usual, float(high) + usual)
 
 
 def _signal_figures(history: History, axis: _Axis) -> list[Figure]:

@@ -35,7 +35,6 @@ from diransac.report.runs import Run, simulate_all
 
 __all__ = ["write_recording"]
 
-_TIMELINE = "time"
 _MEASURED, _PREDICTED, _OUTLIERS, _OTHER = (120, 120, 120), (31, 119, 180), (214, 39, 40), (44, 160, 44)
 """Colours, red, green and blue."""
 
@@ -162,7 +161,7 @@ def _send(rerun: Any, recording: Any, path: str, series: _Series) -> None:
     sent[[rows.start for rows in runs(~known) if rows.stop - rows.start >= usual]] = True
     if sent.any():
         columns = rerun.Scalars.columns(scalars=series.values[known]).partition(known[sent].astype(np.int64))
-        recording.send_columns(path, [rerun.TimeColumn(_TIMELINE, duration=series.time[sent])], columns)
+        recording.send_columns(path, [rerun.TimeColumn("time", duration=series.time[sent])], columns)
 
 
 def _text(text: str) -> str:

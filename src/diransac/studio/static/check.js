@@ -1,4 +1,20 @@
-import { h, link, number, outcome, printed, put, run, table, unchanged } from "./page.js";
+import {
+  button,
+  download,
+  h,
+  isRate,
+  notes,
+  number,
+  numberField,
+  places,
+  outcome,
+  printed,
+  put,
+  run,
+  table,
+  toStage,
+  unchanged,
+} from "./page.js";
 
 const WORDS = {
   well: ["well determined", "is-good"],
@@ -13,21 +29,18 @@ export const check = (root, now) => {
     found = null,
     limits = null,
     opened = false;
-  const status = h("div"),
-    about = h("div"),
-    design = h("div"),
-    outcomeOfDesign = h("div");
+  const [status, about, design, designed] = places(4);
   put(
     root,
-    h("h2", {}, "Check"),
-    h("p.how", {}, "Signals, excitation, and the intervals to expect, by least squares over the first log."),
+    h("h2", "Check"),
+    h("p.how", "Signals, excitation, and the intervals to expect, by least squares over the first log."),
     status,
     about,
     design,
-    outcomeOfDesign,
+    designed,
   );
   const drawFound = () => {
-    const { fitness, signals, notes } = found,
+    const { fitness, signals } = found,
       lacking = fitness.missing.filter((x) => !fitness.derivable.includes(x));
     const rows = Object.entries(fitness.excitation).map(([name, x]) => {
       const [words, look] = WORDS[fitness.verdicts[name]],
@@ -40,7 +53,7 @@ export const check = (root, now) => {
           : "–",
         x.unit,
         x.relative_error === null ? "–" : `${number(100 * x.relative_error, 2)} %`,
-        h(`span.${look}`, {}, words),
+        h(`span.${look}`, words),
       ];
     });
     put(
@@ -48,30 +61,23 @@ export const check = (root, now) => {
       lacking.length > 0 &&
         h(
           ".card.bad",
-          {},
-          h("h3", {}, "The log lacks signals"),
-          h("p", {}, lacking.join(", ")),
-          h("a.button", { href: "#data" }, "Choose their columns in Data"),
+          h("h3", "The log lacks signals"),
+          h("p", lacking.join(", ")),
+          toStage("data", "Choose their columns in Data"),
         ),
       fitness.derivable.length > 0 &&
-        h("p", {}, `Not measured, estimated where it is needed: ${fitness.derivable.join(", ")}.`),
+        h("p", `Not measured, estimated where it is needed: ${fitness.derivable.join(", ")}.`),
       fitness.reason &&
         h(
           ".card.care",
-          {},
-          h("p", {}, fitness.reason),
-          /fix/.test(fitness.reason) && h("a.button", { href: "#model" }, "Give known values in Model"),
+          h("p", fitness.reason),
+          /fix/.test(fitness.reason) && toStage("model", "Give known values in Model"),
         ),
       rows.length > 0 &&
         table(["parameter", "least squares", "interval to expect", "unit", "error", ""], rows),
-      fitness.caveat && h("p.how", {}, fitness.caveat),
-      h("h3", {}, "Signals"),
-      notes.length > 0 &&
-        h(
-          "ul.notes",
-          {},
-          notes.map((x) => h("li", {}, x)),
-        ),
+      fitness.caveat && h("p.how", fitness.caveat),
+      h("h3", "Signals"),
+      notes(found.notes),
       table(
         ["signal", "unit", "minimum", "maximum", "std", "Hz", "missing", "spikes", "frozen"],
         Object.entries(signals).map(([name, x]) => [
@@ -96,26 +102,22 @@ export const check = (root, now) => {
     }
     if (!limits) {
       limits = {};
-      for (const name of [
-        ...Object.keys(equations.inputs),
-        ...Object.keys(equations.signals).filter((x) => !/_d+ot$/.test(x)),
-      ]) {
+      const units = { ...equations.signals, ...equations.inputs },
+        names = Object.keys(equations.signals).filter((name) => !isRate(name));
+      for (const name of [...Object.keys(equations.inputs), ...names]) {
         const x = found?.signals[name];
-        const unit = equations.inputs[name] ?? equations.signals[name];
-        if (x && x.maximum > x.minimum && unit !== "1")
+        if (x && x.maximum > x.minimum && units[name] !== "1")
           limits[name] = [x.minimum, x.maximum].map((y) => Number(y.toPrecision(3)));
       }
     }
     const field = (name, k) =>
-      h("input", {
-        type: "number",
-        step: "any",
-        value: limits[name][k],
+      numberField(limits[name][k], (text) => (limits[name][k] = Number(text)), {
         "aria-label": `${k ? "largest" : "smallest"} ${name}`,
-        onchange: (event) => {
-          limits[name][k] = Number(event.target.value);
-        },
       });
+    const remove = (name) => {
+      delete limits[name];
+      drawDesign(state);
+    };
     const known = Object.fromEntries(
       Object.entries(found?.fitness.excitation || {})
         .filter(([, x]) => x.estimate !== null)
@@ -124,10 +126,9 @@ export const check = (root, now) => {
     const parameters = { ...known, ...(state.project.fix || {}) };
     put(
       design,
-      h("h3", {}, "The experiment that would tell more"),
+      h("h3", "The experiment that would tell more"),
       h(
         "p.how",
-        {},
         "A motion within limits from which the parameters are identified best. The limits are the ranges of the log, or those of the robot's description.",
       ),
       !state.robot &&
@@ -139,52 +140,22 @@ export const check = (root, now) => {
               opened = event.target.open;
             },
           },
-          h("summary", {}, `Limits of ${Object.keys(limits).length} quantities`),
-          h(
-            ".scroll",
-            {},
-            h(
-              "table",
-              {},
-              h(
-                "tbody",
-                {},
-                Object.keys(limits).map((name) =>
-                  h(
-                    "tr",
-                    {},
-                    h("th", { scope: "row" }, name),
-                    h("td", {}, field(name, 0)),
-                    h("td", {}, "to"),
-                    h("td", {}, field(name, 1)),
-                    h(
-                      "td",
-                      {},
-                      h(
-                        "button",
-                        {
-                          type: "button",
-                          onclick: () => {
-                            delete limits[name];
-                            drawDesign(state);
-                          },
-                        },
-                        "no limit",
-                      ),
-                    ),
-                  ),
-                ),
-              ),
-            ),
+          h("summary", `Limits of ${Object.keys(limits).length} quantities`),
+          table(
+            null,
+            Object.keys(limits).map((name) => [
+              name,
+              field(name, 0),
+              "to",
+              field(name, 1),
+              button("no limit", () => remove(name)),
+            ]),
           ),
         ),
       h(
         ".row",
-        {},
-        h(
-          "button",
-          { type: "button", onclick: () => run("design", { limits: state.robot ? {} : limits, parameters }) },
-          "Design an experiment",
+        button("Design an experiment", () =>
+          run("design", { limits: state.robot ? {} : limits, parameters }),
         ),
         outcome(state.jobs.design, "Designing, up to half a minute"),
       ),
@@ -193,7 +164,7 @@ export const check = (root, now) => {
   const drawDesigned = async (state) => {
     const made = await printed(state, "design");
     put(
-      outcomeOfDesign,
+      designed,
       made && [
         table(
           ["parameter", "standard error to expect", "with plain sines", "unit"],
@@ -204,11 +175,7 @@ export const check = (root, now) => {
             x.unit,
           ]),
         ),
-        h(
-          "p",
-          {},
-          h("a.button", { href: link("download", { name: "experiment.csv" }) }, "Download experiment.csv"),
-        ),
+        h("p", download("experiment.csv")),
       ],
     );
   };
@@ -223,7 +190,6 @@ export const check = (root, now) => {
         status,
         h(
           ".empty",
-          {},
           wanted.startsWith("#") ? wanted.slice(2) : "Confirm in Model that your own code may run.",
         ),
       );
@@ -238,7 +204,10 @@ export const check = (root, now) => {
       put(
         status,
         outcome(job, "Reading the log and counting what it can tell"),
-        h(".row", {}, h("button", { type: "button", onclick: () => run("check") }, "Check again")),
+        h(
+          ".row",
+          button("Check again", () => run("check")),
+        ),
       );
     if (job?.status === "failed") put(about);
     if (job?.status === "done" && job.command === wanted && shown !== `${job.number}`) {

@@ -1,4 +1,21 @@
-import { change, choice, get, h, number, outcome, printed, put, run, say, unchanged } from "./page.js";
+import {
+  button,
+  change,
+  choice,
+  get,
+  h,
+  isRate,
+  notes,
+  number,
+  outcome,
+  places,
+  printed,
+  put,
+  run,
+  say,
+  told,
+  unchanged,
+} from "./page.js";
 import { Plots } from "./plots.js";
 
 const ROLES = [
@@ -25,22 +42,17 @@ export const data = (root, now) => {
     reading = "",
     chosen = new Set(),
     applied = 0;
-  const files = h("div"),
-    about = h("div"),
-    mapping = h("div"),
-    canvas = h("div"),
-    left = h("div");
-  const modes = h(".row"),
-    plotted = h("div", {}, modes, canvas, left);
+  const [files, about, mapping, canvas, left] = places(5),
+    modes = h(".row"),
+    plotted = h("div", modes, canvas, left);
   put(
     root,
-    h("h2", {}, "Data"),
+    h("h2", "Data"),
     h(
       "p.how",
-      {},
       "Choose the logs to identify from, and hold out one to test the model with. Nothing leaves this machine, and no file is changed.",
     ),
-    h(".columns", {}, h("div", {}, h("h3", {}, "Logs"), files, mapping), h("div", {}, about, plotted)),
+    h(".columns", h("div", h("h3", "Logs"), files, mapping), h("div", about, plotted)),
   );
   const project = () => now().project;
   const plots = new Plots(canvas, {
@@ -67,22 +79,17 @@ export const data = (root, now) => {
       listed.logs.length
         ? h(
             "ul.list",
-            {},
             listed.logs.map(({ name, size: bytes }) =>
               h(
                 name === file ? "li.chosen" : "li",
-                {},
-                h("button", { type: "button", title: name, onclick: () => open(name) }, name),
-                h("span.size", {}, size(bytes)),
-                choice(role(name), ROLES, {
-                  "aria-label": `role of ${name}`,
-                  onchange: (event) => setRole(name, event.target.value),
-                }),
+                button(name, () => open(name), { title: name }),
+                h("span.size", size(bytes)),
+                choice(role(name), ROLES, (key) => setRole(name, key), { "aria-label": `role of ${name}` }),
               ),
             ),
           )
-        : h(".empty", {}, "No logs in these folders."),
-      listed.more && h("p.how", {}, "There are more files; start diransac studio with a smaller folder."),
+        : h(".empty", "No logs in these folders."),
+      listed.more && h("p.how", "There are more files; start diransac studio with a smaller folder."),
     );
 
   const open = async (name) => {
@@ -95,7 +102,7 @@ export const data = (root, now) => {
     if (key === reading) return;
     if (name !== file) {
       chosen = new Set();
-      put(about, h("p.how", {}, `Reading ${name} …`));
+      put(about, h("p.how", `Reading ${name} …`));
       plotted.hidden = true;
     }
     [reading, file] = [key, name];
@@ -111,47 +118,36 @@ export const data = (root, now) => {
       drawLog();
     } catch (error) {
       facts = null;
-      put(about, h("h3", {}, name), h("p.error", {}, error.message));
+      put(about, h("h3", name), h("p.error", error.message));
       plotted.hidden = true;
       drawMapping();
     }
   };
-  const chip = ({ name, unit, missing }) =>
-    h(
-      "button.chip",
-      {
-        type: "button",
-        draggable: true,
-        "aria-pressed": String(chosen.has(name)),
-        title: missing
-          ? `${missing} samples are missing; drag it onto a signal of the model`
-          : "drag it onto a signal of the model",
-        onclick: () => {
-          if (!chosen.delete(name)) chosen.add(name);
-          drawLog();
-        },
-        ondragstart: (event) => event.dataTransfer.setData("text/plain", name),
-      },
-      name,
-      unit && h("small.unit", {}, ` ${unit}`),
-      missing > 0 && h("span.bad", {}, `${missing} missing`),
-    );
+  const chip = ({ name, unit, missing }) => {
+    const lacking = missing ? `${missing} samples are missing; ` : "",
+      text = [name, unit && h("small.unit", ` ${unit}`), missing > 0 && h("span.bad", `${missing} missing`)];
+    const toggle = () => {
+      if (!chosen.delete(name)) chosen.add(name);
+      drawLog();
+    };
+    return button(text, toggle, {
+      className: "chip",
+      draggable: true,
+      "aria-pressed": chosen.has(name),
+      title: `${lacking}drag it onto a signal of the model`,
+      ondragstart: (event) => event.dataTransfer.setData("text/plain", name),
+    });
+  };
   const drawLog = () => {
     put(
       about,
-      h("h3", {}, file),
+      h("h3", file),
       h(
         "p.how",
-        {},
         `${facts.rows.toLocaleString("en")} rows at ${number(1 / facts.dt, 6)} Hz, ${number(facts.start, 6)} to ${number(facts.start + facts.dt * (facts.rows - 1), 6)} s`,
       ),
-      facts.raw && h("p.how", {}, `These are the fields of the file: ${facts.raw}`),
-      facts.notes.length > 0 &&
-        h(
-          "ul.notes",
-          {},
-          facts.notes.slice(0, 8).map((x) => h("li", {}, x)),
-        ),
+      facts.raw && h("p.how", `These are the fields of the file: ${facts.raw}`),
+      notes(facts.notes.slice(0, 8)),
       h(".chips", { role: "group", "aria-label": "Signals that are shown" }, facts.signals.map(chip)),
     );
     drawModes();
@@ -164,26 +160,20 @@ export const data = (root, now) => {
   };
   const drawModes = () => {
     if (unchanged(modes, plots.mode, project()["leave-out"])) return;
-    const mode = (key, text) =>
-      h(
-        "button",
-        {
-          type: "button",
-          "aria-pressed": String(plots.mode === key),
-          onclick: () => {
-            plots.mode = key;
-            canvas.classList.toggle("leaving", key === "leave");
-            drawModes();
-          },
-        },
-        text,
-      );
+    const mode = (key, text) => {
+      const choose = () => {
+        plots.mode = key;
+        canvas.classList.toggle("leaving", key === "leave");
+        drawModes();
+      };
+      return button(text, choose, { "aria-pressed": plots.mode === key });
+    };
     put(
       modes,
       mode("zoom", "Drag to zoom"),
       mode("leave", "Drag to leave out"),
-      h("button", { type: "button", onclick: () => plots.zoom(...plots.home) }, "Whole log"),
-      h("span.how", {}, "Double-click or 0: all; arrows, + and −; Shift and wheel."),
+      button("Whole log", () => plots.zoom(...plots.home)),
+      h("span.how", "Double-click or 0: all; arrows, + and −; Shift and wheel."),
     );
     const ranges = project()["leave-out"] || [];
     put(
@@ -191,17 +181,12 @@ export const data = (root, now) => {
       ranges.length > 0 &&
         h(
           ".row",
-          {},
-          h("span.how", {}, "Left out of every log:"),
+          h("span.how", "Left out of every log:"),
           ranges.map((ends, k) =>
-            h(
-              "button.chip",
-              {
-                type: "button",
-                title: "take it back",
-                onclick: () => change({ "leave-out": ranges.filter((_, j) => j !== k) }),
-              },
+            button(
               `${number(ends[0], 6)} … ${number(ends[1], 6)} s  ✕`,
+              () => change({ "leave-out": ranges.filter((_, j) => j !== k) }),
+              { className: "chip", title: "take it back" },
             ),
           ),
         ),
@@ -216,20 +201,11 @@ export const data = (root, now) => {
       jobs,
     } = now();
     if (unchanged(mapping, now().project, model, facts, jobs.map?.number, jobs.map?.status)) return;
-    if (!name) {
-      put(
-        mapping,
-        h("h3", {}, "Signals of the model"),
-        h("p.how", {}, "Choose a model to see which of its signals the log has."),
-      );
-      return;
-    }
-    if (!model || !facts) {
-      put(
-        mapping,
-        h("h3", {}, "Signals of the model"),
-        h("p.how", {}, facts ? "Read the model in Model first." : ""),
-      );
+    if (!name || !model || !facts) {
+      const what = name
+        ? facts && "Read the model in Model first."
+        : "Choose a model to see which of its signals the log has.";
+      put(mapping, h("h3", "Signals of the model"), h("p.how", what));
       return;
     }
     const columns = facts.fields,
@@ -241,7 +217,7 @@ export const data = (root, now) => {
     const row = ([signal, unit]) => {
       const from =
         map[signal] || (!facts.raw && has.has(signal) ? signal : columns.includes(signal) ? signal : "");
-      const state = from ? "✓" : model.derivable(signal) ? "derived" : "missing";
+      const state = from ? "✓" : isRate(signal) ? "derived" : "missing";
       const drop = {
         ondragover: (event) => {
           event.preventDefault();
@@ -254,50 +230,35 @@ export const data = (root, now) => {
           assign(signal, event.dataTransfer.getData("text/plain"));
         },
       };
-      const options = [
-        ["", "–"],
-        ...(from && !columns.includes(from) ? [[from, from]] : []),
-        ...columns.map((x) => [x, x]),
-      ];
+      const options = [["", "–"], ...(from && !columns.includes(from) ? [from] : []), ...columns];
       return h(
         "tr",
         drop,
-        h("th", { scope: "row" }, signal, h("span.unit", {}, ` ${unit}`)),
+        h("th", { scope: "row" }, signal, h("span.unit", ` ${unit}`)),
         h(
           "td",
-          {},
-          choice(from, options, {
+          choice(from, options, (column) => assign(signal, column), {
             "aria-label": `column of ${signal}`,
             disabled: Boolean(file_),
-            onchange: (event) => assign(signal, event.target.value),
           }),
         ),
-        h(state === "missing" ? "td.is-bad" : "td.how", {}, state),
+        h(state === "missing" ? "td.is-bad" : "td.how", state),
       );
     };
     put(
       mapping,
-      h("h3", {}, `Signals of ${name}`),
+      h("h3", `Signals of ${name}`),
       h(
         ".row",
-        {},
-        h(
-          "button",
-          {
-            type: "button",
-            onclick: () => {
-              applied = -1;
-              run("map", { log: file });
-            },
-          },
-          "Suggest",
-        ),
-        file_ && h("span.how", {}, `by the mapping ${file_}`),
-        (file_ || Object.keys(map).length > 0) &&
-          h("button", { type: "button", onclick: () => change({ mapping: null, map: {} }) }, "Clear"),
+        button("Suggest", () => {
+          applied = -1;
+          run("map", { log: file });
+        }),
+        file_ && h("span.how", `by the mapping ${file_}`),
+        (file_ || Object.keys(map).length > 0) && button("Clear", () => change({ mapping: null, map: {} })),
       ),
       outcome(jobs.map, "Looking for columns"),
-      h(".scroll.tall", {}, h("table", {}, h("tbody", {}, model.signals.map(row)))),
+      h(".scroll.tall", h("table", h("tbody", model.map(row)))),
     );
   };
   const suggested = async (state) => {
@@ -312,22 +273,17 @@ export const data = (root, now) => {
     if (missing.length) say(`Not found: ${missing.join(", ")}. Choose their columns by hand.`);
     change(found.mapping ? { mapping: found.mapping, map: {} } : { map });
   };
-  get("files")
-    .then((found) => {
-      listed = found;
-      drawFiles();
-      if (!file && found.logs.length) open(found.logs[0].name);
-    })
-    .catch((error) => say(error.message));
+  told(get("files")).then((found) => {
+    listed = found || listed;
+    drawFiles();
+    if (!file && listed.logs.length) open(listed.logs[0].name);
+  });
   return async (state) => {
     if (!file && (state.project.logs || []).length) open(state.project.logs[0]);
     drawFiles();
     suggested(state);
     const equations = await printed(state, "model");
-    model = equations && {
-      signals: [...Object.entries(equations.signals), ...Object.entries(equations.inputs)],
-      derivable: (x) => /_d+ot$/.test(x),
-    };
+    model = equations && [...Object.entries(equations.signals), ...Object.entries(equations.inputs)];
     if (file) open(file);
     if (facts) {
       drawModes();

@@ -1,4 +1,4 @@
-import { clean, h, put, run, say, unchanged } from "./page.js";
+import { button, clean, h, put, run, say, unchanged } from "./page.js";
 import { data } from "./data.js";
 import { model } from "./model.js";
 import { check } from "./check.js";
@@ -25,11 +25,11 @@ const chosen = () => (location.hash.slice(1) in STAGES ? location.hash.slice(1) 
 const look = (key) => {
   const { project, jobs, results: found } = state,
     job = jobs[JOBS[key]];
-  if (job && (job.status === "running" || job.status === "failed")) return job.status;
+  if (job?.status === "running" || job?.status === "failed") return job.status;
   if (key === "data") return (project.logs || []).length ? "done" : "";
-  if (key === "model") return job && job.status === "done" ? "done" : project.model ? "care" : "";
+  if (key === "model") return job?.status === "done" ? "done" : project.model ? "care" : "";
   if (key === "solve") return found.length ? (state.stale ? "care" : "done") : "";
-  return job && job.status === "done" ? "done" : "";
+  return job?.status === "done" ? "done" : "";
 };
 const drawNav = () =>
   unchanged(document.getElementById("stages"), chosen(), Object.keys(STAGES).map(look)) ||
@@ -45,43 +45,23 @@ const drawCommands = () => {
   const commands = state.commands[chosen()],
     text = clean(commands[language]);
   if (unchanged(document.getElementById("commands"), text, language)) return;
-  const tab = (key, name) =>
-    h(
-      "button",
-      {
-        type: "button",
-        "aria-pressed": String(language === key),
-        onclick: () => {
-          language = key;
-          drawCommands();
-        },
-      },
-      name,
-    );
-  const copy = h(
-    "button",
-    {
-      type: "button",
-      onclick: async () => {
-        await navigator.clipboard
-          .writeText(text)
-          .catch(() => say("the browser does not allow copying; select the text"));
-        copy.textContent = "Copied";
-      },
-    },
-    "Copy",
-  );
+  const tab = (key, name) => {
+    const choose = () => {
+      language = key;
+      drawCommands();
+    };
+    return button(name, choose, { "aria-pressed": language === key });
+  };
+  const copy = button("Copy", async () => {
+    await navigator.clipboard
+      .writeText(text)
+      .catch(() => say("the browser does not allow copying; select the text"));
+    copy.textContent = "Copied";
+  });
   put(
     document.getElementById("commands"),
-    h(
-      ".row",
-      {},
-      h("span", {}, "The same by hand:"),
-      tab("shell", "Command line"),
-      tab("python", "Python"),
-      copy,
-    ),
-    h("pre", { tabIndex: 0 }, h("code", {}, text)),
+    h(".row", h("span", "The same by hand:"), tab("shell", "Command line"), tab("python", "Python"), copy),
+    h("pre", { tabIndex: 0 }, h("code", text)),
   );
 };
 const readModel = () => {

@@ -1,6 +1,33 @@
-import { change, choice, get, h, number, outcome, post, printed, put, run, say, unchanged } from "./page.js";
+import {
+  button,
+  change,
+  choice,
+  get,
+  h,
+  number,
+  numberField,
+  outcome,
+  places,
+  post,
+  printed,
+  put,
+  run,
+  say,
+  table,
+  told,
+  unchanged,
+} from "./page.js";
 import { View } from "./view.js";
 
+const BODIES = [
+  ["", "known"],
+  ["all", "all unknown"],
+];
+const BASES = [
+  ["", "fixed"],
+  ["held", "floating, held"],
+  ["measured", "floating, measured"],
+];
 const UNKNOWN = ["armature", "damping", "friction", "spring", "stribeck", "offset"];
 const bounds = (x) =>
   [
@@ -18,49 +45,27 @@ export const model = (root, now) => {
     viewed = "",
     read = "",
     source = null;
-  const list = h("div"),
-    about = h("div"),
-    code = h("div"),
-    place = h("div"),
-    equations = h("div");
+  const [list, about, code, place, equations] = places(5);
   put(
     root,
-    h("h2", {}, "Model"),
-    h("p.how", {}, "Choose the equations whose parameters are to be identified."),
-    h(".columns", {}, h("div", {}, list), h("div", {}, about, code, place, equations)),
+    h("h2", "Model"),
+    h("p.how", "Choose the equations whose parameters are to be identified."),
+    h(".columns", h("div", list), h("div", about, code, place, equations)),
   );
-  const pick = (name) =>
-    change({
-      model: name,
-      fix: {},
-      unknown: null,
-      bodies: null,
-      base: null,
-      joints: null,
-      control: {},
-      motor: {},
-    });
+  const others = { unknown: null, bodies: null, base: null, joints: null, control: {}, motor: {} };
+  const pick = (name) => change({ model: name, fix: {}, ...others });
   const entries = (title, names) =>
     names.length > 0 && [
-      h("h3", {}, title),
+      h("h3", title),
       h(
         "ul.list",
-        {},
-        names.map((name) =>
-          h(
-            name === now().project.model ? "li.chosen" : "li",
-            {},
-            h(
-              "button",
-              {
-                type: "button",
-                "aria-pressed": String(name === now().project.model),
-                onclick: () => pick(name),
-              },
-              name,
-            ),
-          ),
-        ),
+        names.map((name) => {
+          const isChosen = name === now().project.model;
+          return h(
+            isChosen ? "li.chosen" : "li",
+            button(name, () => pick(name), { "aria-pressed": isChosen }),
+          );
+        }),
       ),
     ];
   const drawList = () => {
@@ -86,52 +91,30 @@ export const model = (root, now) => {
       change({ unknown: chosen.includes(x) ? chosen.filter((y) => y !== x) : [...chosen, x] });
     put(
       about,
-      h("h3", {}, project.model),
+      h("h3", project.model),
       state.robot &&
         h(
           "div",
-          {},
           h(
             ".row",
-            {},
             "Unknown in every joint:",
             UNKNOWN.map((x) =>
-              h(
-                "button.chip",
-                { type: "button", "aria-pressed": String(chosen.includes(x)), onclick: () => toggle(x) },
-                x,
-              ),
+              button(x, () => toggle(x), { className: "chip", "aria-pressed": chosen.includes(x) }),
             ),
           ),
           h(
             ".row",
-            {},
             h(
               "label",
-              {},
               "Inertial parameters of bodies",
-              choice(
-                (project.bodies || [""])[0] === "all" ? "all" : "",
-                [
-                  ["", "known"],
-                  ["all", "all unknown"],
-                ],
-                { onchange: (event) => change({ bodies: event.target.value ? ["all"] : null }) },
+              choice((project.bodies || [""])[0] === "all" ? "all" : "", BODIES, (key) =>
+                change({ bodies: key ? [key] : null }),
               ),
             ),
             h(
               "label",
-              {},
               "Base",
-              choice(
-                project.base || "",
-                [
-                  ["", "fixed"],
-                  ["held", "floating, held"],
-                  ["measured", "floating, measured"],
-                ],
-                { onchange: (event) => change({ base: event.target.value || null }) },
-              ),
+              choice(project.base || "", BASES, (key) => change({ base: key || null })),
             ),
           ),
         ),
@@ -144,145 +127,82 @@ export const model = (root, now) => {
       return;
     }
     if (!source || source.sha256 !== state.code.sha256 || source.name !== state.code.name)
-      source = await get("code").catch((error) => say(error.message));
+      source = await told(get("code"));
     if (!source) return;
     if (unchanged(code, state.code, source)) return;
+    const confirm = async () => {
+      if (await post("confirm", { name: source.name, sha256: source.sha256 })) run("model");
+    };
     put(
       code,
-      h("pre", { tabIndex: 0 }, h("code", {}, source.text)),
+      h("pre", { tabIndex: 0 }, h("code", source.text)),
       !state.code.confirmed &&
         h(
           ".card.care",
-          {},
-          h("h3", {}, `Run ${state.code.name}?`),
-          h("p", {}, "It is a program and runs with your rights. It has not been run yet."),
-          h(
-            "button.main",
-            {
-              type: "button",
-              onclick: async () => {
-                if (await post("confirm", { name: source.name, sha256: source.sha256 })) run("model");
-              },
-            },
-            `Run ${state.code.name}`,
-          ),
+          h("h3", `Run ${state.code.name}?`),
+          h("p", "It is a program and runs with your rights. It has not been run yet."),
+          button(`Run ${state.code.name}`, confirm, { className: "main" }),
         ),
     );
   };
-  const drawEquations = (found, state) => {
-    const fixed = state.project.fix || {};
+  const drawEquations = (found, fixed) => {
     const fix = (name, text) => {
       const rest = Object.fromEntries(Object.entries(fixed).filter(([x]) => x !== name)),
         value = Number(text);
       if (text !== "" && !Number.isFinite(value)) say(`${text} is no number`);
       else change({ fix: text === "" ? rest : { ...rest, [name]: value } });
     };
+    const field = (name) =>
+      numberField(fixed[name], (text) => fix(name, text), {
+        placeholder: "identify",
+        "aria-label": `known value of ${name}`,
+      });
+    const withUnits = (units) =>
+      Object.entries(units)
+        .map(([x, unit]) => `${x} [${unit}]`)
+        .join(", ");
     put(
       equations,
-      h("h3", {}, "Parameters"),
-      table_(found, fixed, fix),
-      h("h3", {}, "Equations"),
-      h("pre", { tabIndex: 0 }, h("code", {}, found.equations.join("\n"))),
-      h("h3", {}, "Signals"),
-      h(
-        "p",
-        {},
-        Object.entries(found.signals)
-          .map(([x, unit]) => `${x} [${unit}]`)
-          .join(", "),
+      h("h3", "Parameters"),
+      table(
+        ["parameter", "unit", "bounds", "nominal", "known value"],
+        Object.entries(found.parameters).map(([name, x]) => [
+          name,
+          x.unit,
+          bounds(x),
+          number(x.value),
+          field(name),
+        ]),
       ),
-      h(
-        "p",
-        {},
-        "Inputs: ",
-        Object.entries(found.inputs)
-          .map(([x, unit]) => `${x} [${unit}]`)
-          .join(", "),
-      ),
+      h("h3", "Equations"),
+      h("pre", { tabIndex: 0 }, h("code", found.equations.join("\n"))),
+      h("h3", "Signals"),
+      h("p", withUnits(found.signals)),
+      h("p", "Inputs: ", withUnits(found.inputs)),
     );
   };
-  const table_ = (found, fixed, fix) =>
-    h(
-      ".scroll",
-      {},
-      h(
-        "table",
-        {},
-        h(
-          "thead",
-          {},
-          h(
-            "tr",
-            {},
-            ["parameter", "unit", "bounds", "nominal", "known value"].map((x) =>
-              h("th", { scope: "col" }, x),
-            ),
-          ),
-        ),
-        h(
-          "tbody",
-          {},
-          Object.entries(found.parameters).map(([name, x]) =>
-            h(
-              "tr",
-              {},
-              h("th", { scope: "row" }, name),
-              h("td", {}, x.unit),
-              h("td", {}, bounds(x)),
-              h("td.number", {}, number(x.value)),
-              h(
-                "td",
-                {},
-                h("input", {
-                  type: "number",
-                  step: "any",
-                  value: fixed[name] ?? "",
-                  placeholder: "identify",
-                  "aria-label": `known value of ${name}`,
-                  onchange: (event) => fix(name, event.target.value),
-                }),
-              ),
-            ),
-          ),
-        ),
-      ),
-    );
-  const drawView = async (state) => {
-    const key = JSON.stringify([
-      state.project.model,
-      state.project.logs,
-      state.project.map,
-      state.project.mapping,
-    ]);
-    if (key === viewed || state.code || !state.project.model || state.project.model.endsWith(".json")) {
-      if (state.code) put(place);
-      return;
+  const drawView = (state) => {
+    const { model: name, logs, map, mapping } = state.project,
+      key = JSON.stringify([name, logs, map, mapping]);
+    if (state.code) {
+      view?.stop();
+      viewed = "";
+      put(place);
     }
+    if (key === viewed || state.code || name.endsWith(".json")) return;
     viewed = key;
-    view?.stop();
-    view = new View();
-    try {
-      await view.load({ ...(state.project.logs?.length ? { name: state.project.logs[0] } : {}) });
-      put(place, view.element);
-      view.start();
-    } catch (error) {
-      put(place, h("p.how", {}, `No view: ${error.message}`));
-    }
+    view = View.show(place, logs?.length ? { name: logs[0] } : {}, view);
   };
-  get("files")
-    .then((found) => {
-      listed = found;
-      drawList();
-    })
-    .catch((error) => say(error.message));
+  told(get("files")).then((found) => {
+    listed = found || listed;
+    drawList();
+  });
   return async (state) => {
     drawList();
     if (!state.project.model) {
       unchanged(about);
-      put(about, h(".empty", {}, "No model yet."));
-      put(code);
-      put(place);
-      put(equations);
+      put(about, h(".empty", "No model yet."));
+      [code, place, equations].forEach((x) => put(x));
       return;
     }
     drawRobot(state);
@@ -298,7 +218,7 @@ export const model = (root, now) => {
     const key = JSON.stringify([job.number, state.project.fix]);
     if (key !== read) {
       read = key;
-      drawEquations(await printed(state, "model"), state);
+      drawEquations(await printed(state, "model"), state.project.fix || {});
     }
   };
 };

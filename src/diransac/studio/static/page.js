@@ -5,8 +5,10 @@ export const clean = (text) =>
     x === "\n" ? x : `\\u${x.charCodeAt(0).toString(16).padStart(4, "0")}`,
   );
 
-export const h = (name, about = {}, ...children) => {
-  const [tag, ...classes] = name.split(".");
+// An element by its tag and classes; attributes and listeners, where there are any; and children.
+export const h = (name, ...children) => {
+  const about = children[0]?.constructor === Object ? children.shift() : {},
+    [tag, ...classes] = name.split(".");
   const element = document.createElement(tag || "div");
   if (classes.length) element.className = classes.join(" ");
   for (const [key, value] of Object.entries(about)) {
@@ -41,21 +43,18 @@ export const get = async (name, query) => (await answer(await fetch(address(name
 export const numbers = async (name, query, signal) =>
   (await answer(await fetch(address(name, query), { signal }))).arrayBuffer();
 export const link = address;
-export const post = async (name, body) => {
-  try {
-    await answer(
-      await fetch(`api/${name}`, {
-        method: "POST",
-        headers: { "content-type": "application/json" },
-        body: JSON.stringify(body),
-      }),
-    );
-    return true;
-  } catch (error) {
-    say(error.message);
-    return false;
-  }
-};
+// What a promise has, or a message about its failure.
+export const told = (promise) => promise.catch((error) => say(error.message));
+export const post = (name, body) =>
+  told(
+    fetch(`api/${name}`, {
+      method: "POST",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify(body),
+    })
+      .then(answer)
+      .then(() => true),
+  );
 let fading;
 export const say = (text) => {
   const box = document.getElementById("message");
@@ -77,49 +76,44 @@ export const number = (x, digits = 4) => {
       : String(+x.toPrecision(digits));
   return text.replace(/-/g, "−");
 };
-export const table = (header, rows, caption) =>
-  h(
-    ".scroll",
-    {},
-    h(
-      "table",
-      {},
-      caption && h("caption", {}, caption),
-      h(
-        "thead",
-        {},
-        h(
-          "tr",
-          {},
-          header.map((x) => h("th", { scope: "col" }, x)),
-        ),
-      ),
-      h(
-        "tbody",
-        {},
-        rows.map((row) =>
-          h(
-            "tr",
-            {},
-            row.map((x, k) =>
-              k
-                ? h(typeof x === "string" && /^[−\d–]/.test(x) ? "td.number" : "td", {}, x)
-                : h("th", { scope: "row" }, x),
-            ),
-          ),
-        ),
-      ),
-    ),
-  );
-export const choice = (value, options, about) => {
-  const element = h(
-    "select",
-    about,
-    options.map(([key, text]) => h("option", { value: key }, text)),
-  );
+// A table whose rows begin with a heading; columns have names where a header is given.
+export const table = (header, rows) => {
+  const cell = (x) => h(typeof x === "string" && /^[−\d–]/.test(x) ? "td.number" : "td", x);
+  const row = ([name, ...cells]) => h("tr", h("th", { scope: "row" }, name), cells.map(cell));
+  const columns = header?.map((x) => h("th", { scope: "col" }, x));
+  return h(".scroll", h("table", columns && h("thead", h("tr", columns)), h("tbody", rows.map(row))));
+};
+export const button = (text, onclick, about) => h("button", { type: "button", onclick, ...about }, text);
+export const numberField = (value, onchange, about) =>
+  h("input", {
+    type: "number",
+    step: "any",
+    value: value ?? "",
+    onchange: (event) => onchange(event.target.value),
+    ...about,
+  });
+// A menu of pairs of a value and its text, or of texts.
+export const choice = (value, options, onchange, about) => {
+  const entries = options
+      .map((x) => [x].flat())
+      .map(([key, text = key]) => h("option", { value: key }, text)),
+    element = h("select", { onchange: (event) => onchange(event.target.value), ...about }, entries);
   element.value = value;
   return element;
 };
+export const notes = (texts) => {
+  const items = texts.map((x) => h("li", x));
+  return texts.length > 0 && h("ul.notes", items);
+};
+// Places of a stage, each of which is drawn by itself.
+export const places = (n) => Array.from({ length: n }, () => h("div"));
+export const toStage = (stage, text) => h("a.button", { href: `#${stage}` }, text);
+export const download = (name, text = `Download ${name}`) =>
+  h("a.button", { href: link("download", { name }) }, text);
+export const noResult = () => h(".empty", "No result yet. ", toStage("solve", "Solve"));
+// Whether a signal can be derived from others, by its name.
+export const isRate = (name) => /_d+ot$/.test(name);
+
 // Contents of the latest job of a kind, fetched once for each job.
 const known = {};
 export const printed = async (state, kind) => {
@@ -131,6 +125,6 @@ export const printed = async (state, kind) => {
 };
 export const outcome = (job, busy) => {
   if (!job) return null;
-  if (job.status === "running") return h("p.how", {}, `${busy} …`);
-  return job.status === "failed" ? h("p.error", {}, job.error) : null;
+  if (job.status === "running") return h("p.how", `${busy} …`);
+  return job.status === "failed" ? h("p.error", job.error) : null;
 };

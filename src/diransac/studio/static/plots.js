@@ -4,7 +4,7 @@ import { h, numbers, number, put } from "./page.js";
 // Signals over one time axis, thinned out by the server to the pixels that there are.
 const KEYS = { ArrowLeft: [-0.2, 1], ArrowRight: [0.2, 1], "+": [0, 0.5], "=": [0, 0.5], "-": [0, 2] };
 const color = (name) => {
-  const probe = document.body.appendChild(h("i", {}));
+  const probe = document.body.appendChild(h("i"));
   probe.style.color = `var(--${name})`;
   const found = getComputedStyle(probe).color;
   probe.remove();
@@ -68,7 +68,7 @@ export class Plots {
           frame = h(
             ".plot",
             { tabIndex: 0, onkeydown: (event) => this.key(event), "aria-label": `${name} over time` },
-            h("h4", {}, name, h("small.unit", {}, this.units[name] ? ` ${this.units[name]}` : ""), count),
+            h("h4", name, h("small.unit", this.units[name] ? ` ${this.units[name]}` : ""), count),
           );
         const axis = {
           stroke: ink,
@@ -139,25 +139,27 @@ export class Plots {
       ["width", Math.min(1500, this.width)],
       ...this.names.map((x) => ["signal", x]),
     ];
+    // A reader of an answer: the next numbers of it.
+    const answer = async (...more) => {
+      const found = new Float64Array(await numbers("series", [...query, ...more], asked.signal));
+      let at = 0;
+      return (n) => found.subarray(at, (at += n));
+    };
     this.box.classList.add("busy");
     try {
-      this.read_(await numbers("series", query, asked.signal), 3, ([start, step, n], part) => {
-        const low = part(n);
-        return { lines: this.merged(start, step, low, part(n)) };
-      });
+      const next = await answer();
+      for (const name of this.names) {
+        const [start, step, n] = next(3);
+        this.fill(name, { lines: this.merged(start, step, next(n), next(n)), marks: null });
+      }
       this.root.dataset.painted = `${begin} ${end}`;
       this.box.classList.remove("busy");
-      await new Promise((done) => {
-        setTimeout(done, 150);
-      }); // a search that nobody waits for while the view moves
-      this.read_(
-        await numbers("series", [...query, ["outliers", 1]], asked.signal),
-        2,
-        ([n, total], part) => {
-          const times = part(n);
-          return { marks: [times, part(n)], total };
-        },
-      );
+      await new Promise((done) => setTimeout(done, 150)); // a search that nobody waits for while the view moves
+      const nextMark = await answer(["outliers", 1]);
+      for (const name of this.names) {
+        const [n, total] = nextMark(2);
+        this.fill(name, { marks: [nextMark(n), nextMark(n)], total });
+      }
     } catch (error) {
       if (error.name !== "AbortError") put(this.readout, error.message);
     } finally {
@@ -165,27 +167,14 @@ export class Plots {
     }
   }
 
-  // Parts of an answer, a head of some numbers for each signal and what it counts.
-  read_(content, width, made) {
-    const found = new Float64Array(content);
-    let at = 0;
-    const part = (k) => {
-      at += k;
-      return found.subarray(at - k, at);
-    };
-    for (const name of this.names) {
-      const got = made(part(width), part),
-        shown = this.plots.get(name);
-      if (!shown) continue;
-      Object.assign(shown, got.lines ? { marks: null } : {}, got);
-      if (got.total)
-        put(shown.count, got.total > 0 ? `${got.total} outliers` : "too long to be searched for outliers");
-      shown.plot.setData(
-        shown.marks
-          ? this.marked(shown.lines, shown.marks)
-          : [...shown.lines, shown.lines[0].map(() => null)],
-      );
-    }
+  fill(name, found) {
+    const shown = this.plots.get(name);
+    if (!shown) return;
+    Object.assign(shown, found);
+    const { plot, count, lines, marks } = shown;
+    if (found.total)
+      put(count, found.total > 0 ? `${found.total} outliers` : "too long to be searched for outliers");
+    plot.setData(marks ? this.marked(lines, marks) : [...lines, lines[0].map(() => null)]);
   }
 
   merged(start, step, low, high) {

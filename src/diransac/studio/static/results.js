@@ -1,34 +1,35 @@
 import {
+  button,
   change,
   choice,
   get,
   h,
   link,
+  noResult,
   number,
+  numberField,
   outcome,
+  places,
   printed,
   put,
   run,
-  say,
   table,
+  told,
   unchanged,
 } from "./page.js";
 import { View } from "./view.js";
 
 const LEVELS = { usable: "good", "usable with care": "care", "do not rely on this": "bad" };
-const SHOWN = ["bad", "care", "good"];
-export const verdict = (found, title) =>
+const verdict = (found, title) =>
   h(
     `.card.${LEVELS[found.verdict]}`,
-    {},
-    h("h3", {}, title ? `${title}: ${found.verdict}` : found.verdict),
+    h("h3", title ? `${title}: ${found.verdict}` : found.verdict),
     h(
       "ul",
-      {},
       found.findings
-        .filter((x) => SHOWN.includes(x.level))
+        .filter((x) => Object.values(LEVELS).includes(x.level))
         .slice(0, 7)
-        .map((x) => h(`li.${x.level}`, {}, x.text)),
+        .map((x) => h(`li.${x.level}`, x.text)),
     ),
   );
 const whisker = (value, narrow, wide) => {
@@ -63,42 +64,41 @@ export const results = (root, now) => {
     log = "",
     predicted = 0,
     horizon = null;
-  const pick = h("div"),
-    about = h("div"),
-    held = h("div"),
-    pages = h("div"),
-    frame = h("div"),
-    motion = h("div");
-  put(root, h("h2", {}, "Results"), pick, about, held, motion, pages, frame);
+  const [pick, about, held, pages, frame, motion] = places(6);
+  put(root, h("h2", "Results"), pick, about, held, motion, pages, frame);
   const drawResult = async (state) => {
     const key = `${state.results.join()} ${state.jobs.solve?.number} ${state.stale}`;
     if (!state.results.length) {
       shown = "";
-      put(about, h(".empty", {}, "No result yet. ", h("a.button", { href: "#solve" }, "Solve")));
+      put(about, noResult());
       return;
     }
     if (!state.results.includes(chosen)) [chosen] = state.results;
+    const pickLimb = (name) => {
+      chosen = name;
+      shown = "";
+      drawResult(now());
+      drawPages(now(), page);
+    };
+    const solveAgain = () => {
+      run("solve");
+      location.hash = "solve";
+    };
+    const addTerms = async () => {
+      if ((await change({ "with-suggestions": true })) && (await run("solve"))) location.hash = "solve";
+    };
     put(
       pick,
       state.results.length > 1 &&
         h(
           ".row",
-          {},
           h(
             "label",
-            {},
             "Limb",
             choice(
               chosen,
               state.results.map((x) => [x, x.replace(/^.*model-|\.json$/g, "")]),
-              {
-                onchange: (event) => {
-                  chosen = event.target.value;
-                  shown = "";
-                  drawResult(now());
-                  drawPages(now(), page);
-                },
-              },
+              pickLimb,
             ),
           ),
         ),
@@ -123,19 +123,8 @@ export const results = (root, now) => {
       state.stale &&
         h(
           "p.error",
-          {},
           "The project has changed since this result was made. ",
-          h(
-            "button",
-            {
-              type: "button",
-              onclick: () => {
-                run("solve");
-                location.hash = "solve";
-              },
-            },
-            "Solve again",
-          ),
+          button("Solve again", solveAgain),
         ),
       verdict(found),
       table(
@@ -152,8 +141,7 @@ export const results = (root, now) => {
       found.suggestions.length > 0 &&
         h(
           "div",
-          {},
-          h("h3", {}, "Terms that the model seems to lack"),
+          h("h3", "Terms that the model seems to lack"),
           table(
             ["term", "coefficient", "unit", "explains", "change of the model"],
             found.suggestions.map((x, k) => [
@@ -161,84 +149,43 @@ export const results = (root, now) => {
               `${number(x.value)} ± ${number(x.standard_error, 2)}`,
               x.unit,
               `${Math.round(100 * x.explained)} %`,
-              h("code", {}, found.changes[k]),
+              h("code", found.changes[k]),
             ]),
           ),
-          h(
-            ".row",
-            {},
-            h(
-              "button",
-              {
-                type: "button",
-                onclick: async () => {
-                  if ((await change({ "with-suggestions": true })) && (await run("solve")))
-                    location.hash = "solve";
-                },
-              },
-              "Add these terms and solve again",
-            ),
-          ),
+          h(".row", button("Add these terms and solve again", addTerms)),
         ),
       found.competition &&
         h(
           "details",
-          {},
-          h("summary", {}, "Competition: estimates compared by held-out prediction"),
+          h("summary", "Competition: estimates compared by held-out prediction"),
           table(found.competition.header, found.competition.rows),
         ),
     );
   };
   const drawHeld = async (state) => {
     const heldOut = state.project["held-out"] || [],
+      job = state.jobs.validate,
+      setHorizon = (text) => (horizon = Number(text) || null),
       made = await printed(state, "validate");
-    if (
-      unchanged(
-        held,
-        heldOut,
-        made,
-        state.results,
-        state.jobs.validate?.status,
-        state.jobs.validate?.error,
-        chosen,
-      )
-    )
-      return;
+    if (unchanged(held, heldOut, made, state.results, job?.status, job?.error, chosen)) return;
     put(
       held,
-      h("h3", {}, "Prediction over held-out logs"),
+      h("h3", "Prediction over held-out logs"),
       heldOut.length
         ? h(
             ".row",
-            {},
-            h(
-              "button",
-              {
-                type: "button",
-                disabled: !state.results.length || state.jobs.validate?.status === "running",
-                onclick: () => run("validate", { horizon, result: chosen }),
-              },
-              `Predict ${heldOut.join(", ")}`,
-            ),
+            button(`Predict ${heldOut.join(", ")}`, () => run("validate", { horizon, result: chosen }), {
+              disabled: !state.results.length || job?.status === "running",
+            }),
             h(
               "label",
-              {},
               "restart every",
-              h("input", {
-                type: "number",
-                step: "any",
-                min: 0,
-                value: horizon ?? "",
-                placeholder: "auto",
-                onchange: (event) => {
-                  horizon = Number(event.target.value) || null;
-                },
-              }),
+              numberField(horizon, setHorizon, { min: 0, placeholder: "auto" }),
               "s",
             ),
           )
-        : h("p.how", {}, "No log is held out. ", h("a", { href: "#data" }, "Set one aside in Data.")),
-      outcome(state.jobs.validate, "Predicting"),
+        : h("p.how", "No log is held out. ", h("a", { href: "#data" }, "Set one aside in Data.")),
+      outcome(job, "Predicting"),
       made && verdict(made, "Held out"),
     );
   };
@@ -252,17 +199,8 @@ export const results = (root, now) => {
       all.length > 0 &&
         h(
           ".tabs",
-          {},
           all.map(([kind, text]) =>
-            h(
-              "button",
-              {
-                type: "button",
-                "aria-pressed": String(page.startsWith(kind)),
-                onclick: () => drawPages(now(), kind),
-              },
-              text,
-            ),
+            button(text, () => drawPages(now(), kind), { "aria-pressed": page.startsWith(kind) }),
           ),
         ),
     );
@@ -281,7 +219,7 @@ export const results = (root, now) => {
     );
     drawPages(state);
   };
-  const drawMotion = async (state) => {
+  const drawMotion = (state) => {
     const logs = [...(state.project["held-out"] || []), ...(state.project.logs || [])],
       job = state.jobs.predict;
     if (!logs.includes(log)) [log] = logs;
@@ -295,61 +233,32 @@ export const results = (root, now) => {
         : unchanged(motion, logs, log, job?.status, job?.error)
     )
       return;
+    const predict = () => {
+      predicted = -1;
+      run("predict", { log, horizon: horizon || 1, result: chosen });
+    };
     const place = motion.querySelector(".place") || h(".place");
     put(
       motion,
-      h("h3", {}, "Measured beside predicted motion"),
+      h("h3", "Measured beside predicted motion"),
       h(
         ".row",
-        {},
         h(
           "label",
-          {},
           "Log",
-          choice(
-            log,
-            logs.map((x) => [x, x]),
-            {
-              onchange: (event) => {
-                log = event.target.value;
-              },
-            },
-          ),
+          choice(log, logs, (name) => (log = name)),
         ),
-        h(
-          "button",
-          {
-            type: "button",
-            disabled: job?.status === "running",
-            onclick: () => {
-              predicted = -1;
-              run("predict", { log, horizon: horizon || 1, result: chosen });
-            },
-          },
-          "Show the motion",
-        ),
+        button("Show the motion", predict, { disabled: job?.status === "running" }),
       ),
       outcome(job, "Predicting"),
       place,
     );
     if (job?.status !== "done" || predicted !== -1) return;
     predicted = job.number;
-    view?.stop();
-    view = new View();
-    try {
-      await view.load({ name: log, predicted: 1 });
-      put(place, view.element);
-      view.start();
-    } catch (error) {
-      put(place, h("p.how", {}, `No view: ${error.message}`));
-    }
+    view = View.show(place, { name: log, predicted: 1 }, view);
   };
   return (state) => {
-    drawResult(state)
-      .then(() => {
-        drawPages(state);
-      })
-      .catch((error) => say(error.message));
+    told(drawResult(state).then(() => drawPages(state)));
     drawHeld(state);
     drawMotion(state);
   };

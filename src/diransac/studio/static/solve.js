@@ -1,41 +1,44 @@
-import { change, choice, h, number, post, put, run, table } from "./page.js";
+import {
+  button,
+  change,
+  choice,
+  h,
+  number,
+  numberField,
+  places,
+  post,
+  put,
+  run,
+  table,
+  toStage,
+  unchanged,
+} from "./page.js";
 
 const METHODS = ["lo-diransac", "i-diransac", "diransac", "nls", "ols", "tls"];
 const spark = (values) => {
   const low = Math.min(...values),
     wide = Math.max(...values) - low || 1,
-    NS = "http://www.w3.org/2000/svg";
-  const svg = document.createElementNS(NS, "svg"),
-    line = document.createElementNS(NS, "polyline");
-  svg.setAttribute("viewBox", "0 0 80 18");
-  svg.setAttribute("width", "80");
-  svg.setAttribute("height", "18");
-  line.setAttribute(
-    "points",
-    values
-      .map((x, k) => `${4 + (72 * k) / Math.max(1, values.length - 1)},${15 - (12 * (x - low)) / wide}`)
-      .join(" "),
-  );
-  line.setAttribute("fill", "none");
-  line.setAttribute("stroke", "currentColor");
-  line.setAttribute("stroke-width", "1.5");
-  svg.append(line);
+    last = Math.max(1, values.length - 1);
+  const make = (name, attributes) => {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    return element;
+  };
+  const points = values.map((x, k) => `${4 + (72 * k) / last},${15 - (12 * (x - low)) / wide}`).join(" "),
+    svg = make("svg", { viewBox: "0 0 80 18", width: 80, height: 18 });
+  svg.append(make("polyline", { points, fill: "none", stroke: "currentColor", "stroke-width": 1.5 }));
   return svg;
 };
 
 // The identification while it runs: stage, best answer so far, its residuals and held-out error; it can be ended early.
 export const solve = (root, now) => {
-  const options = h("div"),
-    bar = h("div"),
-    live = h("div");
-  let drawn = "",
-    ticking = 0;
+  const [options, bar, live] = places(3);
+  let ticking = 0;
   put(
     root,
-    h("h2", {}, "Solve"),
+    h("h2", "Solve"),
     h(
       "p.how",
-      {},
       "Estimates by several methods compete, and held-out prediction decides. The page may be closed meanwhile.",
     ),
     options,
@@ -43,76 +46,36 @@ export const solve = (root, now) => {
     live,
   );
   const drawOptions = ({ project }) => {
-    const key = JSON.stringify(project);
-    if (key === drawn) return;
-    drawn = key;
-    const field = (name, label, about = {}) =>
-      h(
-        "label",
-        {},
-        label,
-        h("input", {
-          type: "number",
-          step: "any",
-          min: 0,
-          value: project[name] ?? "",
-          placeholder: about.none || "–",
-          onchange: (event) =>
-            change({ [name]: event.target.value === "" ? null : Number(event.target.value) }),
-        }),
-      );
+    if (unchanged(options, project)) return;
+    const method = project.method || METHODS[0];
+    const field = (name, label, placeholder) => {
+      const set = (text) => change({ [name]: text === "" ? null : Number(text) });
+      return h("label", label, numberField(project[name], set, { min: 0, placeholder }));
+    };
+    const tick = (name, text) => {
+      const onchange = (event) => change({ [name]: event.target.checked || null });
+      return h("label", h("input", { type: "checkbox", checked: project[name] || false, onchange }), text);
+    };
     put(
       options,
       h(
         ".row",
-        {},
         h(
           "label",
-          {},
           "Method",
-          choice(
-            project.method || "lo-diransac",
-            METHODS.map((x) => [x, x]),
-            {
-              onchange: (event) =>
-                change({ method: event.target.value === "lo-diransac" ? null : event.target.value }),
-            },
-          ),
+          choice(method, METHODS, (name) => change({ method: name === METHODS[0] ? null : name })),
         ),
-        field("time-limit", "Time limit, s", { none: "none" }),
-        field("horizon", "Horizon, s", { none: "several" }),
+        field("time-limit", "Time limit, s", "none"),
+        field("horizon", "Horizon, s", "several"),
         h(
           "label",
-          {},
           "Seed",
-          h("input", {
-            type: "number",
+          numberField(project.seed ?? 0, (text) => change({ seed: Math.round(Number(text)) || null }), {
             step: 1,
-            value: project.seed ?? 0,
-            onchange: (event) => change({ seed: Math.round(Number(event.target.value)) || null }),
           }),
         ),
-        h(
-          "label",
-          {},
-          h("input", {
-            type: "checkbox",
-            checked: project["with-suggestions"] || false,
-            onchange: (event) => change({ "with-suggestions": event.target.checked || null }),
-          }),
-          "and again with the terms it suggests",
-        ),
-        !["lo-diransac", undefined].includes(project.method) &&
-          h(
-            "label",
-            {},
-            h("input", {
-              type: "checkbox",
-              checked: project.differentiate || false,
-              onchange: (event) => change({ differentiate: event.target.checked || null }),
-            }),
-            "differentiate what is not measured",
-          ),
+        tick("with-suggestions", "and again with the terms it suggests"),
+        method !== METHODS[0] && tick("differentiate", "differentiate what is not measured"),
       ),
     );
   };
@@ -138,27 +101,22 @@ export const solve = (root, now) => {
       }),
       h(
         "p",
-        {},
-        h("strong", {}, words),
+        h("strong", words),
         `  ${job.status === "running" && last ? `${Math.round(100 * last.fraction)} %, ` : ""}${number(job.seconds, 3)} s`,
       ),
       job.status === "failed" &&
         h(
           "p.error",
-          {},
           job.error,
-          /fix/.test(job.error) &&
-            h("p", {}, h("a.button", { href: "#model" }, "Give known values in Model")),
+          /fix/.test(job.error) && h("p", toStage("model", "Give known values in Model")),
         ),
-      note && h("p", {}, note.note),
+      note && h("p", note.note),
       h(
         ".columns",
-        {},
         best &&
           h(
             "div",
-            {},
-            h("h3", {}, job.status === "running" ? "Best answer so far" : "Last answer of the search"),
+            h("h3", job.status === "running" ? "Best answer so far" : "Last answer of the search"),
             table(
               ["parameter", "value", ""],
               Object.entries(best.parameters).map(([name, x]) => [
@@ -171,17 +129,17 @@ export const solve = (root, now) => {
         residuals &&
           h(
             "div",
-            {},
-            h("h3", {}, "Its residuals"),
+            h("h3", "Its residuals"),
             table(
               ["signal", "standard deviation"],
               Object.entries(residuals.residuals).map(([name, x]) => [name, number(x, 3)]),
             ),
           ),
       ),
-      job.status === "done" && h("p", {}, h("a.button", { href: "#results" }, "See the results")),
+      job.status === "done" && h("p", toStage("results", "See the results")),
     );
   };
+  const stop = (text, atOnce) => button(text, () => post("stop", { kind: "solve", at_once: atOnce }));
   return (state) => {
     drawOptions(state);
     const job = state.jobs.solve,
@@ -194,21 +152,9 @@ export const solve = (root, now) => {
       bar,
       h(
         ".row",
-        {},
-        h("button.main", { type: "button", disabled: running || why, onclick: () => run("solve") }, "Solve"),
-        running &&
-          h(
-            "button",
-            { type: "button", onclick: () => post("stop", { kind: "solve", at_once: false }) },
-            "Stop and keep the best",
-          ),
-        running &&
-          h(
-            "button",
-            { type: "button", onclick: () => post("stop", { kind: "solve", at_once: true }) },
-            "Abort",
-          ),
-        why && h("span.how", {}, "Choose a log in Data and a model in Model first."),
+        button("Solve", () => run("solve"), { className: "main", disabled: running || why }),
+        running && [stop("Stop and keep the best", false), stop("Abort", true)],
+        why && h("span.how", "Choose a log in Data and a model in Model first."),
       ),
     );
     clearInterval(ticking);

@@ -1,4 +1,16 @@
-import { h, link, outcome, printed, put, run } from "./page.js";
+import {
+  button,
+  download,
+  h,
+  noResult,
+  outcome,
+  places,
+  printed,
+  put,
+  run,
+  table,
+  unchanged,
+} from "./page.js";
 
 const KINDS = [
   ["dynamics.c", "C99", "Derivative of the state and a Runge-Kutta step, without allocation."],
@@ -9,13 +21,11 @@ const KINDS = [
 
 // Files for other programs.
 export const use = (root, now) => {
-  const about = h("div"),
-    done = h("div");
-  let drawn = "";
+  const [about, done] = places(2);
   put(
     root,
-    h("h2", {}, "Use"),
-    h("p.how", {}, "Files for other programs; they are written into diransac-results."),
+    h("h2", "Use"),
+    h("p.how", "Files for other programs; they are written into diransac-results."),
     about,
     done,
   );
@@ -28,91 +38,29 @@ export const use = (root, now) => {
         ? [[`calibrated${ending}`, "Calibrated description", `${model} with the identified values in it.`]]
         : []),
     ];
+    const row = ([name, kind, text]) => {
+      const field = h("input", { value: name, "aria-label": `name of the file, ${kind}`, maxLength: 99 });
+      return [kind, text, field, button("Write", () => run("export", { name: field.value.trim() }))];
+    };
+    const report = state.results[0].replace("model", "report").replace(".json", ".html"),
+      whole = state.results.map((x) => download(x, x.replace(/^.*\//, "")));
     put(
       about,
-      h(
-        ".scroll",
-        {},
-        h(
-          "table",
-          {},
-          h(
-            "tbody",
-            {},
-            kinds.map(([name, kind, text]) => {
-              const field = h("input", {
-                value: name,
-                "aria-label": `name of the file, ${kind}`,
-                maxLength: 99,
-              });
-              return h(
-                "tr",
-                {},
-                h("th", { scope: "row" }, kind),
-                h("td", {}, text),
-                h("td", {}, field),
-                h(
-                  "td",
-                  {},
-                  h(
-                    "button",
-                    { type: "button", onclick: () => run("export", { name: field.value.trim() }) },
-                    "Write",
-                  ),
-                ),
-              );
-            }),
-            h(
-              "tr",
-              {},
-              h("th", { scope: "row" }, "Result"),
-              h("td", {}, "Everything that was found, for diransac."),
-              h("td"),
-              h(
-                "td",
-                {},
-                state.results.map((x) =>
-                  h("a.button", { href: link("download", { name: x }) }, x.replace(/^.*\//, "")),
-                ),
-              ),
-            ),
-            h(
-              "tr",
-              {},
-              h("th", { scope: "row" }, "Report"),
-              h("td", {}, "One page that loads nothing, to be sent."),
-              h("td"),
-              h(
-                "td",
-                {},
-                h(
-                  "a.button",
-                  {
-                    href: link("download", {
-                      name: state.results[0].replace("model", "report").replace(".json", ".html"),
-                    }),
-                  },
-                  "report.html",
-                ),
-              ),
-            ),
-          ),
-        ),
-      ),
+      table(null, [
+        ...kinds.map(row),
+        ["Result", "Everything that was found, for diransac.", [], whole],
+        ["Report", "One page that loads nothing, to be sent.", [], download(report, "report.html")],
+      ]),
     );
   };
   return async (state) => {
     if (!state.results.length) {
-      drawn = "";
-      put(about, h(".empty", {}, "No result yet. ", h("a.button", { href: "#solve" }, "Solve")));
+      unchanged(about);
+      put(about, noResult());
       put(done);
       return;
     }
-    const key = JSON.stringify([state.results, state.project.model]);
-    if (key !== drawn) {
-      drawn = key;
-      drawKinds(state);
-    }
+    if (!unchanged(about, state.results, state.project.model)) drawKinds(state);
     const job = state.jobs.export,
       text = await printed(state, "export"),
       name = job && /-o ['"]?diransac-results\/([^'"]+?)['"]?( --into|$)/.exec(job.command);
@@ -123,13 +71,11 @@ export const use = (root, now) => {
         job.status === "done" &&
         h(
           ".card.good",
-          {},
           text
             .trim()
             .split("\n")
-            .map((x) => h("p", {}, x)),
-          name &&
-            h("p", {}, h("a.button", { href: link("download", { name: name[1] }) }, `Download ${name[1]}`)),
+            .map((x) => h("p", x)),
+          name && h("p", download(name[1])),
         ),
     );
   };

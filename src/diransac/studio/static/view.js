@@ -1,4 +1,4 @@
-import { h, number, numbers, put } from "./page.js";
+import { button, h, number, numbers, put } from "./page.js";
 
 // Bodies in three dimensions: shapes and their places over time as MuJoCo has computed them, drawn by WebGL.
 const VERTEX = `attribute vec3 p; attribute vec3 n; uniform mat4 camera; uniform mat3 turn; uniform vec3 at; varying vec3 normal;
@@ -30,10 +30,25 @@ export class View {
         this.draw();
       },
     });
-    this.button = h("button", { type: "button", onclick: () => this.play() }, "Play");
+    this.button = button("Play", () => this.play());
     this.label = h("span.how");
-    this.controls = h(".row", {}, this.button, this.slider, this.label);
-    this.element = h("div", {}, h(".view", {}, this.canvas), this.controls);
+    this.controls = h(".row", this.button, this.slider, this.label);
+    this.element = h("div", h(".view", this.canvas), this.controls);
+  }
+
+  // A view of a scene in a place, in which it follows another one.
+  static show(place, query, before) {
+    before?.stop();
+    const view = new View();
+    view
+      .load(query)
+      .then(() => {
+        if (view.ended) return;
+        put(place, view.element);
+        view.start();
+      })
+      .catch((error) => put(place, h("p.how", `No view: ${error.message}`)));
+    return view;
   }
 
   async load(query) {
@@ -100,23 +115,15 @@ export class View {
       reach = 12 + Math.ceil(Math.min(way, 30 * step) / step),
       lines = [],
       [cx, cy] = this.center.map((x) => Math.round(x / step) * step);
+    const corner = (x, y) => lines.push(cx + x * step, cy + y * step, this.floor);
     // Short pieces, of which those behind the camera are simply not there.
     for (let k = -reach; k <= reach; k += 1) {
-      for (let j = -reach; j < reach; j += 1)
-        lines.push(
-          cx + k * step,
-          cy + j * step,
-          this.floor,
-          cx + k * step,
-          cy + (j + 1) * step,
-          this.floor,
-          cx + j * step,
-          cy + k * step,
-          this.floor,
-          cx + (j + 1) * step,
-          cy + k * step,
-          this.floor,
-        );
+      for (let j = -reach; j < reach; j += 1) {
+        corner(k, j);
+        corner(k, j + 1);
+        corner(j, k);
+        corner(j + 1, k);
+      }
     }
     this.grid = gl.createBuffer();
     this.lines = lines.length / 3;
@@ -125,7 +132,7 @@ export class View {
     this.slider.max = n - 1;
     this.controls.hidden = n < 2;
     if (this.head.motions > 1)
-      this.controls.append(h("span.key", {}, "measured"), h("span.key.second", {}, "predicted"));
+      this.controls.append(h("span.key", "measured"), h("span.key.second", "predicted"));
   }
 
   extent(frame) {
@@ -133,15 +140,8 @@ export class View {
       chosen = moving.length ? moving : this.shapes.map((x, k) => [x, k]);
     const at = (k, j) => this.places[0][(frame * this.shapes.length + k) * 12 + 9 + j];
     const center = [0, 1, 2].map((j) => chosen.reduce((sum, [, k]) => sum + at(k, j) / chosen.length, 0));
-    return {
-      center,
-      size:
-        2 *
-        Math.max(
-          0.05,
-          ...chosen.map(([x, k]) => x.reach + Math.hypot(...center.map((c, j) => at(k, j) - c))),
-        ),
-    };
+    const reaches = chosen.map(([x, k]) => x.reach + Math.hypot(...center.map((c, j) => at(k, j) - c)));
+    return { center, size: 2 * Math.max(0.05, ...reaches) };
   }
 
   start() {
@@ -156,9 +156,7 @@ export class View {
       this.turn((event.clientX - from[0]) / 150, (event.clientY - from[1]) / 150);
       from = [event.clientX, event.clientY];
     });
-    canvas.addEventListener("pointerup", () => {
-      from = null;
-    });
+    canvas.addEventListener("pointerup", () => (from = null));
     canvas.addEventListener(
       "wheel",
       (event) => {
@@ -212,6 +210,7 @@ export class View {
 
   stop() {
     this.playing = false;
+    this.ended = true;
     this.gl?.getExtension("WEBGL_lose_context")?.loseContext();
   }
 

@@ -1,4 +1,4 @@
-"""The command ``simulate``."""
+"""The commands ``simulate``, which writes a noisy log, and ``fly``, which tests an identified model."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from diransac.cli.flight_options import (
     FlightSeed,
     LogOutput,
     NoiseOptions,
+    OptionalLogOutput,
     PlantOptions,
     TrajectoryArgument,
+    TrajectoryOption,
 )
 from diransac.cli.group import grouped
-from diransac.cli.options import JsonFlag, ModelName
+from diransac.cli.options import JsonFlag, ModelName, ResultFile
 from diransac.cli.outputs import staged
+from diransac.identification.result import Result
 
 __all__ = ["app"]
 
@@ -46,3 +49,27 @@ def _simulate(
         if plot:
             simulated.flight.draw(picture)
         screen.show(simulated, as_json)
+
+
+@app.command("fly")
+@grouped
+def _fly(
+    model: ResultFile,
+    shape: TrajectoryOption,
+    plant: PlantOptions,
+    output: OptionalLogOutput = None,
+    plot: FlightPicture = None,
+    seed: FlightSeed = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Plan and control with an identified model, fly the true plant, and show the tracking error."""
+    from diransac.cli.flight_runs import fly_identified
+
+    with staged([output, plot], [model]) as (written, picture):
+        result = Result.load(model)
+        test = fly_identified(shape, result, plant.of(result.model), seed)
+        if output:
+            test.flight.log.write(written)
+        if plot:
+            test.flight.draw(picture)
+        screen.show(test, as_json)
