@@ -20,7 +20,7 @@ from diransac.data.preprocessing import differentiate, rename, scale
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
 from diransac.identification.identify import identify
-from diransac.model.library.servo_axis import servo_axis
+from diransac.model.library.drives import servo_axis
 from diransac.plain_text import one_line
 
 

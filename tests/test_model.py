@@ -370,7 +370,7 @@ def test_every_way_of_solving_for_accelerations_agrees(seed):
         return two_axes(equations)
 
     forms = {1: written(1, 1, 0), -1: written(-1, -1, 0), 0: written(1, 1, 0.5)}
-    assert {sign: model._definite for sign, model in forms.items()} == {1: 1, -1: -1, 0: 0}
+    assert {sign: model.force_sign for sign, model in forms.items()} == {1: 1, -1: -1, 0: 0}
     q, v, _, u, p = random_arguments(forms[1], seed)
     x = np.concatenate([q, v])
     by_form = [np.array(model.dynamics(x, u, p)[1]) for model in forms.values()]

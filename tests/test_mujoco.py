@@ -311,7 +311,7 @@ def test_results_and_descriptions_are_written_and_read(
 
 @pytest.mark.parametrize("inside", ['<asset><mesh file="/etc/passwd"/></asset>', '<include file="a.xml"/>'])
 def test_a_stored_model_that_names_files_is_refused(linkage: tuple[MujocoModel, dr.Result], inside: str) -> None:
-    from diransac.model.mjcf.model import _checksum
+    from diransac.model.model import _checksum
 
     data = linkage[0].to_dict()
     data["mjcf"] = data["mjcf"].replace("<worldbody>", f"{inside}<worldbody>", 1)

@@ -17,7 +17,7 @@ from diransac.data.preprocessing.differentiation import choose_bandwidth
 from diransac.data.readers import read_log
 from diransac.errors import LogError, SettingsError
 from diransac.model import Model, Parameter
-from diransac.model.library.servo_axis import servo_axis
+from diransac.model.library.drives import servo_axis
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 N = 400

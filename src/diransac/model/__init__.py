@@ -10,7 +10,7 @@ as CasADi functions, which everything else takes.  Begin with `model.py`.
 | `derivation.py`, `expressions.py` | checks and symbolic parts of equations; expression graphs as plain data |
 | `plant.py` | `Plant`, a model with parameters, and `Disturbance` |
 | `parts.py` | independent parts of a model, such as limbs |
-| `library/` | the built-in models, a file each |
+| `library/` | the built-in models |
 | `robots/` | models from MJCF and URDF |
 | `mjcf/` | what MuJoCo simulates: contacts, free bases, loops |
 """

@@ -8,7 +8,7 @@ quotient of parameters.
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -29,7 +29,6 @@ __all__ = ["Probe", "Symbols"]
 
 _N_POINTS = 40
 _TOLERANCE = 1e-8
-_NEAR_NOMINAL = 1e-3
 _ARGUMENTS = "qvaup"
 
 
@@ -157,9 +156,9 @@ def check_residual(label: str, residual: ca.Function, accelerations: Sequence[st
             f"{label}: equations return {residual.numel_out(0)} residuals, but there are {len(accelerations)} "
             f"accelerations ({', '.join(accelerations)}); return one residual for each"
         )
-    for i, name in _nan_outputs(residual):
+    for i in _nan_outputs(residual):
         raise ModelError(
-            f"{label}: {name} {i + 1} of {len(accelerations)} contains NaN; a function of Python's math module gives "
+            f"{label}: equation {i + 1} of {len(accelerations)} contains NaN; a function of Python's math module gives "
             "NaN for a symbol: use casadi's"
         )
 
@@ -176,7 +175,7 @@ def check_kinematics(label: str, kinematics: ca.Function) -> None:
 
 def check_readings(label: str, measurement: ca.Function, names: Sequence[str]) -> None:
     """Raises ModelError: a NaN constant in a sensor's equation."""
-    for i, _ in _nan_outputs(measurement):
+    for i in _nan_outputs(measurement):
         raise ModelError(f"{label}: sensor {names[i]!r} contains NaN; use casadi's functions, not Python's math")
 
 
@@ -191,21 +190,21 @@ def check_sensors(label: str, probe: Probe, names: Sequence[str]) -> None:
 
 def check_constants(label: str, what: str, function: ca.Function) -> None:
     """Raises ModelError: a NaN constant in one of the function's results."""
-    for i, _ in _nan_outputs(function):
+    for i in _nan_outputs(function):
         raise ModelError(
             f"{label}: {what} {i + 1} of {function.numel_out(0)} contains NaN; use casadi's functions, not "
             "Python's math"
         )
 
 
-def _nan_outputs(function: ca.Function) -> Iterator[tuple[int, str]]:
+def _nan_outputs(function: ca.Function) -> Iterator[int]:
     """Indices of the outputs whose expression holds a NaN constant."""
     if not expressions.has_nan(function):
         return
     arguments = [ca.SX.sym(n, *function.size_in(i)) for i, n in enumerate(function.name_in())]
     for i, expression in enumerate(ca.vertsplit(function(*arguments))):
         if expressions.has_nan(ca.Function("one", arguments, [expression])):
-            yield i, "equation"
+            yield i
 
 
 class Probe:
@@ -219,7 +218,7 @@ class Probe:
     Points are ``(n, n_points)`` for each argument; ``everywhere`` holds parameters of both signs and many magnitudes.
     """
 
-    def __init__(self, residual: ca.Function, parameters: Sequence[Parameter]) -> None:
+    def __init__(self, residual: ca.Function, parameters: Collection[Parameter]) -> None:
         rng = np.random.default_rng(20231001)
         self.residual = residual
         sizes = [residual.size1_in(i) for i in range(5)]
@@ -269,7 +268,7 @@ def _within(parameter: Parameter, rng: np.random.Generator) -> FloatArray:
     lower = max(parameter.lower, 0.0) if parameter.positive else parameter.lower
     draw = rng.uniform(0.1, 0.9, _N_POINTS)
     if parameter.value is not None:
-        near = parameter.value + _NEAR_NOMINAL * (abs(parameter.value) or _NEAR_NOMINAL) * (draw - 0.5)
+        near = parameter.value + 1e-3 * (abs(parameter.value) or 1e-3) * (draw - 0.5)
         return np.where(parameter.admits(near), near, parameter.value)
     if np.isfinite(lower) and np.isfinite(parameter.upper):
         return lower + draw * (parameter.upper - lower)

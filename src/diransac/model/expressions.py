@@ -31,17 +31,15 @@ _VERSION = 1
 
 
 # fmt: off
-_UNARY = (
+_OPERANDS = {**dict.fromkeys((
     "neg", "sqrt", "sq", "twice", "inv", "fabs", "floor", "ceil", "sign", "not", "exp", "expm1", "log", "log1p", "sinh",
     "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfinv", "sin", "cos", "tan", "asin", "acos", "atan",
-)
-_BINARY = (
+), 1), **dict.fromkeys((
     "add", "sub", "mul", "div", "copysign", "fmin", "fmax", "fmod", "remainder", "hypot", "lt", "le", "eq", "ne", "and",
     "or", "if_else_zero", "pow", "constpow", "atan2",
-)
+), 2)}
 # fmt: on
-_CODES = {name: getattr(ca, f"OP_{name.upper()}") for name in (*_UNARY, *_BINARY)}
-_N_OPERANDS = {**dict.fromkeys(_UNARY, 1), **dict.fromkeys(_BINARY, 2)}
+"""Number of operands of each operation that equations may have."""
 
 _SAME = ("assign", "lift", "printme")
 """Operations whose value is their first operand."""
@@ -168,7 +166,7 @@ def _number(label: str, value: float) -> str:
 
 def _word(label: str, operation: str) -> str:
     """The operation itself.  Raises ModelError: it is not in the list."""
-    if operation in _CODES:
+    if operation in _OPERANDS:
         return operation
     if operation == "call":
         raise ModelError(
@@ -241,11 +239,20 @@ def _value(line: str, values: Sequence[ca.SX], elements: Mapping[str, Sequence[c
     if word in elements:
         (text,) = operands
         return elements[word][_index(text)]
-    if len(operands) != _N_OPERANDS[word]:
+    if len(operands) != _OPERANDS[word]:
         raise ValueError(line)
-    if len(operands) == 1:
-        return ca.SX.unary(_CODES[word], values[_index(operands[0])])
-    return ca.SX.binary(_CODES[word], values[_index(operands[0])], values[_index(operands[1])])
+    return applied(word, *(values[_index(text)] for text in operands))
+
+
+def applied(operation: str, *operands: ca.SX) -> ca.SX:
+    """Expression of an operation of the list."""
+    return (ca.SX.unary if len(operands) == 1 else ca.SX.binary)(_code(operation), *operands)
+
+
+@cache
+def _code(operation: str) -> int:
+    """CasADi's number of an operation."""
+    return int(getattr(ca, f"OP_{operation.upper()}"))
 
 
 def _index(text: str) -> int:
@@ -305,8 +312,7 @@ def printed(
         elif step.operation in _SAME:
             value = operands[0]
         else:
-            apply = ca.SX.unary if len(operands) == 1 else ca.SX.binary
-            value = apply(_CODES[step.operation], *operands)
+            value = applied(step.operation, *operands)
         # Nested operations of a printed expression; deeper ones are printed in several pieces.
         if depth > 150 and step.operation != "output":
             part = f"#{first + len(parts)}"

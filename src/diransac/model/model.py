@@ -18,7 +18,7 @@ import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -154,20 +154,13 @@ class Model(Signals):
         self.residual: ca.Function = made["residual"]
         self.kinematics: ca.Function | None = made["kinematics"]
         self.measurement: ca.Function | None = made["measurement"]
-        self._probe = Probe(self.residual, self._bounds)
+        self._probe = Probe(self.residual, self.parameters.values())
         self._mass_matrix, self._bias = derivation.affine_in_acceleration(self._label, self._probe, self.accelerations)
-        self._definite = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
+        # 1 or -1 where M = dr/da is symmetric and positive or negative definite, so that r is a force; else 0.
+        self.force_sign = derivation.mass_matrix_sign(self._label, self._probe, self._mass_matrix, self.accelerations)
         if self.measurement is not None:
-            derivation.check_sensors(self._label, Probe(self.measurement, self._bounds), tuple(self.sensors))
-
-    @property
-    def _bounds(self) -> tuple[Parameter, ...]:
-        return tuple(self.parameters.values())
-
-    @property
-    def force_sign(self) -> int:
-        """1 or -1 where ``M = dr/da`` is symmetric and positive or negative definite, so that r is a force; else 0."""
-        return self._definite
+            probe = Probe(self.measurement, self.parameters.values())
+            derivation.check_sensors(self._label, probe, tuple(self.sensors))
 
     @cached_property
     def nonlinear_parameters(self) -> tuple[str, ...]:
@@ -295,7 +288,7 @@ class Model(Signals):
         assert self.measurement is not None
         symbols = self._symbols()
         y = self.measurement(*symbols)[[k for k, n in enumerate(self.sensors) if n in names]]
-        return Probe(ca.Function("sensors", list(symbols), [y]), self._bounds)
+        return Probe(ca.Function("sensors", list(symbols), [y]), self.parameters.values())
 
     # ------------------------------------------------------------------ derived functions
 
@@ -351,14 +344,14 @@ class Model(Signals):
 
         Raises ModelError: ``M`` is not symmetric and definite, so the residuals are not a balance of forces.
         """
-        if self._definite == 0:
+        if self.force_sign == 0:
             raise ModelError(
                 f"{self._label}: the mass matrix dr/da is not symmetric and definite, so the equations are not a "
                 "balance of forces to which others could be added; write them as such, or give accelerations"
             )
         q, v, _, u, p = self._symbols()
         f = ca.SX.sym("f", self.n_v)
-        a = self._definite * self._solve_mass(q, v, u, p, f)
+        a = self.force_sign * self._solve_mass(q, v, u, p, f)
         return ca.Function("force_response", [q, v, u, p, f], [ca.densify(a)], list("qvupf"), ["a"])
 
     def with_fixed(self, values: Mapping[str, float]) -> Model:
@@ -405,12 +398,12 @@ class Model(Signals):
 
         Raises ModelError: there would be too many operations.
         """
-        M = ca.sparsify((self._definite or 1) * self._mass_matrix(q, v, u, p))
-        derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self._definite != 0)
-        if self._definite == 0:
+        M = ca.sparsify((self.force_sign or 1) * self._mass_matrix(q, v, u, p))
+        derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self.force_sign != 0)
+        if self.force_sign == 0:
             return ca.solve(ca.densify(M), ca.densify(rhs))
         D, LT, order = ca.ldl(M)
-        return self._definite * ca.ldl_solve(ca.densify(rhs), D, LT, order)
+        return self.force_sign * ca.ldl_solve(ca.densify(rhs), D, LT, order)
 
     def equations_text(self) -> tuple[str, ...]:
         """Every residual as readable text, ``0 = ...``, in the signals' names, and every sensor, ``name = ...``.
@@ -449,7 +442,12 @@ class Model(Signals):
         return hash(self.fingerprint)
 
     def to_dict(self) -> dict[str, Any]:
-        """Names, units, bounds and equations as JSON data, which `from_dict` reads."""
+        """The model as JSON data, which `from_dict` reads."""
+        data = self._to_dict()
+        return {**data, "checksum": _checksum(data)}
+
+    def _to_dict(self) -> dict[str, Any]:
+        """Names, units, bounds and equations."""
         data = {
             "name": self.name,
             "description": self.description,
@@ -463,12 +461,14 @@ class Model(Signals):
         }
         if self.measurement is not None:
             data |= {"sensors": self.sensors, "measurement": self._equations_data["measurement"]}
-        return {**data, "checksum": _checksum(data)}
+        return data
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Model:
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """The model that `to_dict` wrote.  Raises ResultError: the data are damaged."""
         try:
+            if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
+                raise ResultError("the stored model is damaged: its checksum does not match; identify again")
             return cls._from_checked(data)
         except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError, ModelError) as error:
             reason = str(error).partition("\n")[0]
@@ -477,10 +477,9 @@ class Model(Signals):
             ) from error
 
     @classmethod
-    def _from_checked(cls, data: Mapping[str, Any]) -> Model:
+    def _from_checked(cls, data: Mapping[str, Any]) -> Self:
+        """The model of data with the right checksum.  Raises these errors, or ResultError, for others."""
         model = cls.__new__(cls)
-        if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
-            raise ResultError("the stored model is damaged: its checksum does not match; identify again")
         if not isinstance(data["name"], str) or not isinstance(data["description"], str):
             raise TypeError("name or description")
         parameters = {n: Parameter.from_dict(x) for n, x in data["parameters"].items()}
@@ -495,7 +494,7 @@ class Model(Signals):
         return model
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (Model.from_dict, (self.to_dict(),))
+        return (type(self).from_dict, (self.to_dict(),))
 
     def __repr__(self) -> str:
         first_order = f", first_order={list(self.first_order)}" if self.first_order else ""

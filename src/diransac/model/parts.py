@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from itertools import takewhile
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -14,8 +14,6 @@ from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
 __all__ = ["independent_parts"]
-
-T = TypeVar("T")
 
 
 def independent_parts(model: Model) -> dict[str, Model]:
@@ -117,6 +115,6 @@ def _part(model: Model, name: str, group: Sequence[int]) -> Model:
     )
 
 
-def _selected(items: Mapping[str, T], mask: BoolArray) -> dict[str, T]:
+def _selected(items: Mapping[str, Any], mask: BoolArray) -> dict[str, Any]:
     """Items of a mapping by a mask in its order."""
     return {n: x for (n, x), is_in in zip(items.items(), mask, strict=True) if is_in}

@@ -28,10 +28,6 @@ Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, An
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 
 
-_HIGHEST_FREQUENCY = 1e5
-"""Hz, of effects that simulations may resolve: 8000 integration steps per sample at 100 Hz."""
-
-
 class ModelWithParameters(Protocol):
     """A `Plant` or a `Result`."""
 
@@ -95,21 +91,21 @@ class Disturbance:
     ) -> None:
         self.model, self.name = model, name
         self.constants, self.states = dict(constants or {}), dict(states or {})
-        self.start = {**dict.fromkeys(self.states, 0.0), **{n: _as_start(value) for n, value in (start or {}).items()}}
+        # A number as it is, a range as a pair.
+        given = {n: tuple(x) if isinstance(x, Sequence | np.ndarray) else x for n, x in (start or {}).items()}
+        self.start: dict[str, Any] = {**dict.fromkeys(self.states, 0.0), **given}
         self.highest_frequency = float(highest_frequency)
         self._check(rates is not None)
-        sizes = {"q": model.n_q, "v": model.n_v, "u": model.n_u, "p": model.n_p, "d": len(self._own)}
-        q, v, u, p, own = (ca.SX.sym(name, size) for name, size in sizes.items())
+        q, v, u, p, own = (ca.SX.sym(name, size) for name, size in self._sizes.items())
         known = model.named(q, v, v, u, p)
         d = Symbols(self._label, "constants and states", dict(zip(self._own, ca.vertsplit(own), strict=True)))
         arguments = (*known[:2], *known[3:], d)
-        wanted = {
-            "forces": (forces, model.rate_names),
-            "accelerations": (accelerations, model.rate_names),
-            "rates": (rates, tuple(self.states)),
-        }
-        results = [self._expressions(what, *wanted[what], arguments) for what in wanted]
-        effect = ca.Function("effect", [q, v, u, p, own], results, list("qvupd"), list(wanted))
+        effects, names = {"forces": forces, "accelerations": accelerations, "rates": rates}, model.rate_names
+        results = [
+            self._expressions(what, one, tuple(self.states) if what == "rates" else names, arguments)
+            for what, one in effects.items()
+        ]
+        effect = ca.Function("effect", [q, v, u, p, own], results, list("qvupd"), list(effects))
         self._effect_data = expressions.stored(self._label, effect)
         self.effect = self._restored_effect()
         if forces is not None:
@@ -123,6 +119,11 @@ class Disturbance:
     def _own(self) -> tuple[str, ...]:
         """Names of the attributes of ``d``."""
         return (*self.constants, *self.states, "t")
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        """Number of elements of the arguments q, v, u, p and d."""
+        return {**{n: size for n, size in self.model.argument_sizes.items() if n != "a"}, "d": len(self._own)}
 
     def _check(self, has_rates: bool) -> None:
         """Raise ModelError for arguments that do not fit together."""
@@ -144,10 +145,11 @@ class Disturbance:
                 raise ModelError(f"{self._label}: {name} is {value!r}; give a finite number")
             if is_range and value[0] > value[1]:
                 raise ModelError(f"{self._label}: {name} is {value!r}; give the low end of a range first")
-        if not 0.0 <= self.highest_frequency <= _HIGHEST_FREQUENCY:
+        highest = 1e5  # Hz: 8000 integration steps per sample at 100 Hz
+        if not 0.0 <= self.highest_frequency <= highest:
             raise ModelError(
-                f"{self._label}: highest_frequency is {self.highest_frequency:g}; give Hz, from 0 to "
-                f"{_HIGHEST_FREQUENCY:g}, which integration steps can resolve"
+                f"{self._label}: highest_frequency is {self.highest_frequency:g}; give Hz, from 0 to {highest:g}, "
+                "which integration steps can resolve"
             )
 
     def _expressions(
@@ -170,14 +172,9 @@ class Disturbance:
 
     def _restored_effect(self) -> ca.Function:
         """Function ``(q, v, u, p, d) -> (forces, accelerations, rates)`` of the stored effect."""
-        model = self.model
-        sizes = {"q": model.n_q, "v": model.n_v, "u": model.n_u, "p": model.n_p, "d": len(self._own)}
-        results = {"forces": model.n_v, "accelerations": model.n_v, "rates": len(self.states)}
-        return expressions.restored("effect", self._effect_data, sizes, results)
-
-    def drawn_start(self, rng: np.random.Generator) -> list[float]:
-        """Initial states, in order; uniform over those given as a range."""
-        return [float(rng.uniform(*value) if isinstance(value, tuple) else value) for value in self.start.values()]
+        n_v = self.model.n_v
+        results = {"forces": n_v, "accelerations": n_v, "rates": len(self.states)}
+        return expressions.restored("effect", self._effect_data, self._sizes, results)
 
     def __reduce__(self) -> tuple[Any, ...]:
         kept = {name: value for name, value in vars(self).items() if name != "effect"}
@@ -185,11 +182,6 @@ class Disturbance:
 
     def __repr__(self) -> str:
         return f"Disturbance({self.name!r} of {self.model.name!r}, constants={self.constants})"
-
-
-def _as_start(value: Any) -> Any:
-    """A number as it is, a range as a pair."""
-    return tuple(value) if isinstance(value, Sequence | np.ndarray) else value
 
 
 def _restored(kept: Mapping[str, Any]) -> Disturbance:
@@ -225,6 +217,9 @@ class DisturbedModel:
         self.state = (*model.state, *self.own_states)
         self.signals = (*self.state, *model.accelerations, *model.sensors)
         self.quaternions = model.quaternions
+        # As of a model: states of disturbances are velocities, their constants parameters.
+        self.n_q, self.n_v, self.n_u = model.n_q, model.n_v + len(self.own_states), model.n_u
+        self.n_p = len(self.parameters)
 
     @cached_property
     def _equations(self) -> tuple[Any, ...]:
@@ -241,26 +236,6 @@ class DisturbedModel:
 
     def __hash__(self) -> int:
         return hash(self._equations)
-
-    @property
-    def n_q(self) -> int:
-        """Number of coordinates."""
-        return self.model.n_q
-
-    @property
-    def n_v(self) -> int:
-        """Number of states that follow the coordinates: velocities, and those of the disturbances."""
-        return self.model.n_v + len(self.own_states)
-
-    @property
-    def n_u(self) -> int:
-        """Number of inputs."""
-        return self.model.n_u
-
-    @property
-    def n_p(self) -> int:
-        """Number of parameters and constants."""
-        return len(self.parameters)
 
     @cached_property
     def dynamics(self) -> ca.Function:
@@ -381,7 +356,8 @@ class Plant:
         if isinstance(self.simulated, Model):
             return x
         rng = np.random.default_rng(seed)
-        own = [value for one in self.disturbances for value in one.drawn_start(rng)]
+        starts = [start for one in self.disturbances for start in one.start.values()]
+        own = [float(rng.uniform(*start)) if isinstance(start, tuple) else float(start) for start in starts]
         return np.concatenate([x, own, np.zeros(int("t" in self.simulated.own_states))])
 
     def substeps(self, dt: float) -> int:

@@ -35,7 +35,7 @@ from diransac.plain_text import is_one_line
 __all__ = ["Sensor", "accelerometer", "encoder", "gyroscope", "magnetometer", "range_to"]
 
 Attitude: TypeAlias = str | Sequence[str] | Callable[[Any, Any], Any]
-Vector: TypeAlias = Sequence[float] | None
+Vector: TypeAlias = Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def accelerometer(
     attitude: Attitude,
     *,
     rates: Sequence[str] | None = None,
-    lever_arm: Vector | str = None,
+    lever_arm: Vector | str | None = None,
     gravity: Sequence[float] | None = None,
     axes: Sequence[str] | None = None,
     bias: bool = True,
@@ -136,7 +136,8 @@ def accelerometer(
     n = _dimension("accelerometer", position)
     names = _axes("accelerometer", axes, position)
     g = _vector("gravity", (*(0.0,) * (n - 1), -9.81) if gravity is None else gravity, n)
-    arm, arms = _estimated(lever_arm, [f"{name}_arm_{x}" for x in names], "m", "lever_arm")
+    own_names = [f"{name}_arm_{x}" for x in names]
+    arm, arms = (None, {}) if lever_arm is None else _estimated(lever_arm, own_names, "m", "lever_arm")
     if arm is not None and not (isinstance(attitude, str) if n == 2 else rates):
         raise ModelError(
             "accelerometer: a lever arm needs the angular velocity; give attitude by the name of a planar angle"
@@ -261,8 +262,6 @@ def magnetometer(
     """
     n = _dimension("magnetometer", axes)
     B, fields = _estimated(field, [f"{name}_field_{x}" for x in axes], unit, "field")
-    if B is None:
-        raise ModelError('magnetometer: field = None; give its components, or "estimated"')
 
     def turned(at: _Arguments) -> ca.SX:
         return _rotation(attitude, at, n).T @ _values(B, at.p)
@@ -295,8 +294,6 @@ def range_to(
     """
     _dimension("range_to", position)
     aim, points = _estimated(point, [f"{name}_point_{x}" for x in position], unit, "point")
-    if aim is None:
-        raise ModelError('range_to: point = None; give its coordinates, or "estimated"')
 
     def distance(at: _Arguments) -> ca.SX:
         return ca.norm_2(_column(at.q, position) - _values(aim, at.p))
@@ -361,12 +358,10 @@ def _calibrated(
 
 
 def _estimated(
-    given: Vector | str, names: Sequence[str], unit: str, what: str
-) -> tuple[list[float] | list[str] | None, dict[str, Parameter]]:
+    given: Vector | str | None, names: Sequence[str], unit: str, what: str
+) -> tuple[list[float] | list[str], dict[str, Parameter]]:
     """A vector as numbers, or as the names of its parameters; and these parameters."""
-    if given is None:
-        return None, {}
-    if isinstance(given, str):
+    if given is None or isinstance(given, str):
         if given != "estimated":
             raise ModelError(f'{what} = {given!r}; give {len(names)} numbers, or "estimated"')
         return list(names), {name: Parameter(unit) for name in names}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -133,16 +133,17 @@ class Signals:
 
     def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
         """The arguments of the equations: the vectors q, v, a, u and p, or the first few, with named components."""
-        names = {
-            "coordinates": self.coordinates,
-            "velocities": self.rate_names,
-            "accelerations": self.rate_names,
-            "inputs": self.inputs,
-            "parameters": self.parameters,
-        }
+        kinds = ("coordinates", "velocities", "accelerations", "inputs", "parameters")
+        groups: Sequence[Iterable[str]] = (
+            self.coordinates,
+            self.rate_names,
+            self.rate_names,
+            self.inputs,
+            self.parameters,
+        )
         return tuple(
-            Symbols(self._label, kind, dict(zip(names[kind], ca.vertsplit(x), strict=True)))
-            for kind, x in zip(names, vectors, strict=False)
+            Symbols(self._label, kind, dict(zip(names, ca.vertsplit(x), strict=True)))
+            for kind, names, x in zip(kinds, groups, vectors, strict=False)
         )
 
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:

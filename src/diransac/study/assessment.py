@@ -29,10 +29,6 @@ __all__ = [
 ]  # fmt: skip
 
 
-_N_PHASES = 8
-"""Phases that a vibration is averaged over; harmonics up to the seventh cancel exactly."""
-
-
 @dataclass(frozen=True)
 class PlantFacts:
     """Properties of a plant that summaries need and that stores keep, so that a user's file need not be present.
@@ -112,11 +108,11 @@ def mean_accelerations(plant: Plant, log: Log) -> FloatArray:
         return recorded
     x, u = (np.column_stack([log[name] for name in some]) for some in (names.state, names.inputs))
     evaluate, n_own = compile_map(simulated.dynamics), len(simulated.own_states)
-    total = np.zeros_like(recorded)
-    for phase in 2.0 * np.pi * np.arange(_N_PHASES) / _N_PHASES:
+    total, n_phases = np.zeros_like(recorded), 8  # harmonics up to the seventh cancel exactly
+    for phase in 2.0 * np.pi * np.arange(n_phases) / n_phases:
         _, accelerations = evaluate(np.hstack([x, np.full((len(x), n_own), phase)]), u, plant.constants)
         total += accelerations
-    return total / _N_PHASES
+    return total / n_phases
 
 
 def relative_errors(found: npt.ArrayLike, reference: npt.ArrayLike) -> FloatArray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,8 @@ from diransac.study.specification import ControlChoice, FlightChoice, Study
 from diransac.study.tables import check_whole
 
 __all__ = [
-    "PLANNING_TIME_LIMIT", "TrialData", "check_ended", "derived_seed", "flown", "trial_data", "trial_data_batch",
-    "trial_seed",
+    "PLANNING_TIME_LIMIT", "TrialData", "check_ended", "derived_seed", "flown", "together", "trial_data",
+    "trial_data_batch", "trial_seed",
 ]  # fmt: skip
 
 PLANNING_TIME_LIMIT = 600.0
@@ -141,20 +141,26 @@ def flown(
     for some in groups.values():
         steering, drawn = [controllers[k] for k in some], [seeds[k] for k in some]
         substeps = max(least_substeps, plant.substeps(steering[0].dt)) if least_substeps else None
-        logs |= zip(some, _lanes(plant, steering, drawn, substeps), strict=True)
+        fly = partial(_lanes, plant, substeps)
+        logs |= zip(some, together(fly, steering, drawn), strict=True)
     return [logs[k] for k in range(len(controllers))]
 
 
 def _lanes(
-    plant: Plant, controllers: Sequence[Controller], seeds: Sequence[int], substeps: int | None
-) -> Sequence[Log | Exception]:
-    """Flights of one length: all in one simulation, or each on its own if that fails."""
+    plant: Plant, substeps: int | None, controllers: Sequence[Controller], seeds: Sequence[int]
+) -> Sequence[Log]:
+    """Flights of one length in one simulation."""
+    return fly_batch([plant] * len(controllers), controllers, substeps=substeps, seeds=seeds, threads=1)
+
+
+def together(compute: Callable[..., Sequence[Any]], *columns: Sequence[Any]) -> Sequence[Any]:
+    """Results of all rows in one call, or if it fails, of each row by itself, or its error."""
     try:
-        return fly_batch([plant] * len(controllers), controllers, substeps=substeps, seeds=seeds, threads=1)
+        return compute(*columns)
     except Exception as error:  # noqa: BLE001  its row says what it was; other flights go on
-        if len(controllers) == 1:
+        if len(columns[0]) == 1:
             return [error]
-        return [_lanes(plant, [one], [seed], substeps)[0] for one, seed in zip(controllers, seeds, strict=True)]
+        return [together(compute, *([one] for one in row))[0] for row in zip(*columns, strict=True)]
 
 
 def _corrupted(study: Study, flight: Log | Exception, seed: int) -> TrialData:

@@ -134,20 +134,15 @@ class Fleet:
     model: Model
     configuration: Mapping[str, Mapping[str, Any]]
     asked: Mapping[Key, tuple[str | None, str | None]]
-
-    @property
-    def kind(self) -> Kind:
-        """Kind of the store."""
-        return FLEET
+    kind: Kind = FLEET
 
     @property
     def columns(self) -> dict[str, str]:
         """SQL type of each column of a row."""
+        figures = [f"{kind}_{name}" for name in self.model.parameters for kind in ("parameter", "standard_error")]
         return {
             **dict.fromkeys(("own_vehicle", "verdict", "findings"), "TEXT"),
-            "duration": "REAL",
-            **{f"{kind}_{name}": "REAL" for name in self.model.parameters for kind in ("parameter", "standard_error")},
-            **dict.fromkeys(("fit_error", "inlier_fraction"), "REAL"),
+            **dict.fromkeys(("duration", *figures, "fit_error", "inlier_fraction"), "REAL"),
             **dict.fromkeys(("stop_reason", "file_stamp", "file_hash"), "TEXT"),
             "seconds": "REAL NOT NULL",
         }
@@ -214,18 +209,13 @@ def identify_logs(work: bytes, keys: Sequence[Key]) -> list[dict[str, Any]]:
 @lru_cache(maxsize=4)
 def _unpickled(work: bytes) -> tuple[Model, Method, Callable[[Path], Log], Mapping[str, Any]]:
     try:
-        found: tuple[Model, Method, Callable[[Path], Log], Mapping[str, Any]] = pickle.loads(work)
-        return found
+        return pickle.loads(work)  # type: ignore[no-any-return]  # of `identify_each`
     except Exception as error:
         raise StudyError(f"a worker on {platform.node()} cannot load the work: {error}") from error
 
 
 def _row(
-    name: str,
-    model: Model,
-    method: Method,
-    read: Callable[[Path], Log],
-    arguments: Mapping[str, Any],
+    name: str, model: Model, method: Method, read: Callable[[Path], Log], arguments: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The row of one log."""
     begin, row = time.perf_counter(), dict[str, Any](log=name, status="done", error=None, **_marks(Path(name)))
@@ -388,11 +378,11 @@ def read_fleet(store: str | Path) -> FleetRows:
             units = {word(name): word(unit) for name, unit in about["units"].items()}
             model = word(about["model_name"])
             names = [f"{kind}_{name}" for kind in ("parameter", "standard_error") for name in units]
-            values = [quoted(columns[name][0]) for name in names]
+            figures = ", ".join(quoted(columns[name][0]) for name in names)
         # Vehicle of a log that names none.
         rows = kept.select(
             "SELECT log, coalesce(vehicle, own_vehicle, ?), time, place, verdict, "
-            f"{', '.join(values)} FROM trials JOIN asked USING (log) WHERE status = 'done'",
+            f"{figures} FROM trials JOIN asked USING (log) WHERE status = 'done'",
             ("unknown",),
         )
     with damage(Path(store)):
@@ -401,16 +391,9 @@ def read_fleet(store: str | Path) -> FleetRows:
         if np.any(np.isfinite(numbers) & (np.abs(numbers) > LARGEST)):
             raise ValueError("the square of an estimate overflows")
         vehicles = np.array([word(row[1]) for row in rows], np.str_)
-        return FleetRows(
-            model,
-            units,
-            tuple(word(row[0]) for row in rows),
-            vehicles,
-            dict(zip(units, numbers.T[: len(units)], strict=True)),
-            dict(zip(units, numbers.T[len(units) :], strict=True)),
-            tuple(word(row[4]) for row in rows),
-            status,
-        )
+        values, errors = (dict(zip(units, some, strict=True)) for some in np.split(numbers.T, 2))
+        logs, verdicts = (tuple(word(row[k]) for row in rows) for k in (0, 4))
+        return FleetRows(model, units, logs, vehicles, values, errors, verdicts, status)
 
 
 def _moment(text: str | None) -> tuple[float, str]:
@@ -432,12 +415,8 @@ def export_fleet(store: str | Path, path: str | Path) -> None:
         There is no such store, or it has values that are neither numbers nor texts.
     """
     with Store.existing(store, FLEET) as kept:
-        # Columns that are not exported.
-        names = [
-            name
-            for _, name, *_ in kept.select("PRAGMA table_info(trials)")
-            if name not in ("own_vehicle", "file_stamp", "file_hash")
-        ]
+        internal = ("own_vehicle", "file_stamp", "file_hash")
+        names = [name for _, name, *_ in kept.select("PRAGMA table_info(trials)") if name not in internal]
         columns = ", ".join(map(quoted, names[1:]))
         rows = kept.select(
             f"SELECT log, coalesce(vehicle, own_vehicle), time, {columns} FROM asked LEFT JOIN trials USING (log) "

@@ -39,7 +39,6 @@ _SHORTEST = 3
 """Logs on either side of a change."""
 _FEWEST_VEHICLES = 8
 """Vehicles that are compared with each other; fewer are not."""
-_UNRELIABLE = "do not rely on this"
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ class FleetSummary:
     @cached_property
     def unreliable(self) -> dict[str, tuple[int, int]]:
         """Vehicle -> logs with the verdict "do not rely on this", and all; vehicles without such logs left out."""
-        bad = np.array([verdict == _UNRELIABLE for verdict in self.rows.verdicts], bool)
+        bad = np.array([verdict == "do not rely on this" for verdict in self.rows.verdicts], bool)
         names, index = np.unique(self.rows.vehicles, return_inverse=True)
         counts, all_logs = np.bincount(index[bad], minlength=len(names)), np.bincount(index, minlength=len(names))
         return {str(names[k]): (int(counts[k]), int(all_logs[k])) for k in np.flatnonzero(counts)}
@@ -205,10 +204,9 @@ class FleetSummary:
         if self.n_vehicles < _FEWEST_VEHICLES:
             found.append(f"vehicles are not compared: {self.n_vehicles} are too few, {_FEWEST_VEHICLES} are needed")
         if self.unreliable:
-            n = sum(count for count, _ in self.unreliable.values())
-            found.append(
-                f'{plural(n, "log")} of {plural(len(self.unreliable), "vehicle")} with the verdict "{_UNRELIABLE}"'
-            )
+            logs = plural(sum(count for count, _ in self.unreliable.values()), "log")
+            vehicles = plural(len(self.unreliable), "vehicle")
+            found.append(f'{logs} of {vehicles} with the verdict "do not rely on this"')
         return found
 
 

@@ -19,38 +19,23 @@ from diransac.model.plant import Disturbance, Plant
 
 __all__ = ["double_pendulum", "pendulum", "rotorcraft_in_gusts", "servo_axis", "underwater_vehicle"]
 
-SERVO_AXIS: Mapping[str, float] = MappingProxyType(
-    {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0}
-)
-"""kg, N s/m, N, N: an axis of the size of EMPS."""
-
-DOUBLE_PENDULUM: Mapping[str, float] = MappingProxyType(
-    {
-        "inertia1": 0.09,
-        "moment1": 0.3,
-        "inertia2": 0.025,
-        "moment2": 0.12,
-        "rotor_inertia": 6e-5,
-        "viscous_friction1": 0.02,
-        "dry_friction1": 0.08,
-        "viscous_friction2": 0.02,
-        "dry_friction2": 0.05,
-    }
-)
-"""kg m^2, kg m, N m s/rad and N m: a desktop machine."""
-
-PENDULUM: Mapping[str, float] = MappingProxyType({"mass": 0.5, "length": 0.6, "friction": 0.05})
-"""kg, m, N m s/rad."""
+PARAMETERS: Mapping[str, Mapping[str, float]] = MappingProxyType({
+    # kg, N s/m, N, N: an axis of the size of EMPS.
+    "servo axis": {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0},
+    # kg m^2, kg m, N m s/rad and N m: a desktop machine.
+    "double pendulum": {
+        "inertia1": 0.09, "moment1": 0.3, "inertia2": 0.025, "moment2": 0.12, "rotor_inertia": 6e-5,
+        "viscous_friction1": 0.02, "dry_friction1": 0.08, "viscous_friction2": 0.02, "dry_friction2": 0.05,
+    },
+    # kg, m, N m s/rad.
+    "pendulum": {"mass": 0.5, "length": 0.6, "friction": 0.05},
+    # kg, N s/m, N s^2/m^2, N: a vehicle that a person can carry.
+    "underwater vehicle": {"mass": 42.0, "linear_drag": 11.0, "quadratic_drag": 38.0, "bias": 1.6},
+})  # fmt: skip
+"""Default parameters of the machines."""
 
 
-RIPPLES = 126
-"""Periods of a motor's torque per turn of its joint: 21 pole pairs behind a gear of 6."""
-
-_RIPPLE_FREQUENCY = 200.0
-"""Hz, at a joint velocity of 10 rad/s; the integration steps resolve it."""
-
-
-def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXIS) -> Plant:
+def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = PARAMETERS["servo axis"]) -> Plant:
     """`models.servo_axis` with a cogging force of amplitude `cogging`, N, and a period of 24 mm."""
     model = builtin("servo-axis")
 
@@ -69,25 +54,18 @@ def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = SERVO_AXI
     return Plant(model, parameters, (cogs,))
 
 
-def double_pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = DOUBLE_PENDULUM) -> Plant:
+def double_pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PARAMETERS["double pendulum"]) -> Plant:
     """`models.double_pendulum` with a torque ripple of amplitude `ripple`, N m, 126 periods per turn, at each joint."""
     model = builtin("double-pendulum")
 
     def motors(q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {f"q{i}": d.ripple * cos(RIPPLES * q[f"q{i}"] + d[f"phase_{i}"]) for i in (1, 2)}
+        return {f"q{i}": _ripple(d, q[f"q{i}"], d[f"phase_{i}"]) for i in (1, 2)}
 
-    ripples = Disturbance(
-        model,
-        "motors",
-        forces=motors,
-        constants={"ripple": ripple},
-        highest_frequency=_RIPPLE_FREQUENCY,
-        **_phases({"phase_1": 0.0, "phase_2": 0.0}),
-    )
+    ripples = _rippled(model, "motors", ripple, ("phase_1", "phase_2"), forces=motors)
     return Plant(model, parameters, (ripples,))
 
 
-def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PENDULUM) -> Plant:
+def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PARAMETERS["pendulum"]) -> Plant:
     """``a = -g/l sin(q) + (torque - c v) / (m l^2)``: a mass on a rod of unknown length, with a torque ripple, N m.
 
     The length enters as 1/l and 1/l^2: the model is not affine in its parameters.
@@ -98,7 +76,7 @@ def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PENDULUM) ->
         return [a.angle + 9.81 / p.length * sin(q.angle) - torque / (p.mass * p.length**2)]
 
     def motor(q: Symbols, _v: Symbols, _u: Symbols, p: Symbols, d: Symbols) -> dict[str, Any]:
-        return {"angle": d.ripple * cos(RIPPLES * q.angle + d.phase) / (p.mass * p.length**2)}
+        return {"angle": _ripple(d, q.angle, d.phase) / (p.mass * p.length**2)}
 
     model = Model(
         "pendulum",
@@ -111,26 +89,19 @@ def pendulum(ripple: float = 0.0, parameters: Mapping[str, float] = PENDULUM) ->
         },
         equations=equations,
     )
-    ripples = Disturbance(
-        model,
-        "motor",
-        accelerations=motor,
-        constants={"ripple": ripple},
-        highest_frequency=_RIPPLE_FREQUENCY,
-        **_phases({"phase": 0.0}),
-    )
+    ripples = _rippled(model, "motor", ripple, ("phase",), accelerations=motor)
     return Plant(model, parameters, (ripples,))
 
 
-UNDERWATER_VEHICLE: Mapping[str, float] = MappingProxyType(
-    {"mass": 42.0, "linear_drag": 11.0, "quadratic_drag": 38.0, "bias": 1.6}
-)
-"""kg, N s/m, N s^2/m^2, N: a vehicle that a person can carry."""
+def _ripple(d: Symbols, angle: Any, phase: Any) -> Any:
+    """Torque of a motor with 126 periods per turn of its joint: 21 pole pairs behind a gear of 6."""
+    return d.ripple * cos(126 * angle + phase)
 
-_GUSTS = (0.11, 0.23, 0.54, 1.2, 2.6)
-_WAVES = (0.12, 0.19, 0.27)
-_CURRENT = 0.02
-"""Hz: gusts up to the bandwidth of an attitude controller, waves of a lake, a tide in the time of a dive."""
+
+def _rippled(model: Model, name: str, ripple: float, phases: Sequence[str], **effect: Any) -> Disturbance:
+    """Torque ripple, which integration steps resolve up to joint velocities of 10 rad/s, 200 Hz."""
+    states = _phases(dict.fromkeys(phases, 0.0))
+    return Disturbance(model, name, **effect, constants={"ripple": ripple}, highest_frequency=200.0, **states)
 
 
 def rotorcraft_in_gusts(
@@ -138,24 +109,25 @@ def rotorcraft_in_gusts(
 ) -> Plant:
     """The planar rotorcraft in gusts of 0.1 to 2.6 Hz."""
     model = builtin("planar-rotorcraft")
+    rates = (0.11, 0.23, 0.54, 1.2, 2.6)  # Hz, up to the bandwidth of an attitude controller
 
     def air(_q: Symbols, _v: Symbols, _u: Symbols, _p: Symbols, d: Symbols) -> dict[str, Any]:
         sizes = {"x": d.gusts, "z": d.gusts, "theta": d.moment_gusts}
-        return {name: size * _sines(d, f"phase_{name}", _GUSTS) for name, size in sizes.items()}
+        return {name: size * _sines(d, f"phase_{name}", rates) for name, size in sizes.items()}
 
     air_in_motion = Disturbance(
         model,
         "air",
         forces=air,
         constants={"gusts": gusts, "moment_gusts": moment_gusts},
-        highest_frequency=max(_GUSTS),
-        **_turning({f"phase_{name}": _GUSTS for name in model.coordinates}),
+        highest_frequency=max(rates),
+        **_turning({f"phase_{name}": rates for name in model.coordinates}),
     )
     return Plant(model, parameters, (air_in_motion,))
 
 
 def underwater_vehicle(
-    waves: float = 0.0, current: float = 0.0, parameters: Mapping[str, float] = UNDERWATER_VEHICLE
+    waves: float = 0.0, current: float = 0.0, parameters: Mapping[str, float] = PARAMETERS["underwater vehicle"]
 ) -> Plant:
     """`models.underwater_vehicle` in waves and in a slow current, whose drag is that of the motion through the water.
 
@@ -166,21 +138,22 @@ def underwater_vehicle(
     parameters : of the model
     """
     model = builtin("underwater-vehicle")
+    of_waves, of_current = (0.12, 0.19, 0.27), (0.02,)  # Hz: waves of a lake, a tide in the time of a dive
 
     def water(_q: Symbols, v: Symbols, _u: Symbols, p: Symbols, d: Symbols) -> dict[str, Any]:
         def drag(speed: Any) -> Any:
             return p.linear_drag * speed + p.quadratic_drag * fabs(speed) * speed
 
-        through_water = v.x - d.current * _sines(d, "phase_current", (_CURRENT,))
-        return {"x": drag(v.x) - drag(through_water) + d.waves * _sines(d, "phase_waves", _WAVES)}
+        through_water = v.x - d.current * _sines(d, "phase_current", of_current)
+        return {"x": drag(v.x) - drag(through_water) + d.waves * _sines(d, "phase_waves", of_waves)}
 
     water_in_motion = Disturbance(
         model,
         "water",
         forces=water,
         constants={"waves": waves, "current": current},
-        highest_frequency=max(_WAVES),
-        **_turning({"phase_waves": _WAVES, "phase_current": (_CURRENT,)}),
+        highest_frequency=max(of_waves),
+        **_turning({"phase_waves": of_waves, "phase_current": of_current}),
     )
     return Plant(model, parameters, (water_in_motion,))
 

@@ -41,7 +41,6 @@ _KINDS: dict[str, Callable[..., Plant]] = {
     "pendulum": pendulum,
     "underwater-vehicle": underwater_vehicle,
 }
-_DEFAULT_NAME = "plant"
 
 
 class PlantChoice(FunctionTable):
@@ -72,7 +71,7 @@ class PlantChoice(FunctionTable):
     @field_validator("kind")
     @classmethod
     def _known(cls, kind: str) -> str:
-        if kind not in _KINDS and file_and_name(kind, _DEFAULT_NAME) is None:
+        if kind not in _KINDS and file_and_name(kind, "plant") is None:
             raise SettingsError(f"plant.kind is {kind!r:.60}; there are {', '.join(_KINDS)}, or give FILE.py:NAME")
         return kind
 
@@ -194,6 +193,6 @@ def _checked(function: Callable[..., Any], file: Path, name: str) -> Callable[..
 
 def _file_and_name(kind: str) -> tuple[Path, str]:
     """File and function of a user's plant."""
-    found = file_and_name(kind, _DEFAULT_NAME)
+    found = file_and_name(kind, "plant")
     assert found is not None
     return found

@@ -172,14 +172,11 @@ def export(store: str | Path, path: str | Path, kind: str) -> None:
     frame = read(store)
     memory = io.BytesIO()  # Polars' own errors of a full disk are no OSError
     if kind == "parquet":
-        rows = (
-            frame if len(frame) else frame.drop("seconds")
-        )  # without rows it has no stages, which Parquet cannot hold
-        rows.write_parquet(memory)
+        # Without rows there are no stages, which Parquet cannot hold.
+        (frame if len(frame) else frame.drop("seconds")).write_parquet(memory)
     elif kind == "csv":
-        memory.write(
-            pl.DataFrame([list(map(cell, frame.columns))], orient="row").write_csv(include_header=False).encode()
-        )
+        header = pl.DataFrame([list(map(cell, frame.columns))], orient="row")
+        header.write_csv(memory, include_header=False)
         texts = pl.col(pl.String).map_elements(cell, pl.String)
         frame.with_columns(texts, pl.col("seconds").struct.json_encode()).write_csv(memory, include_header=False)
     else:

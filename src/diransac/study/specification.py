@@ -70,10 +70,6 @@ def planned_path(mission: str) -> str:
     return f"{mission} planned"
 
 
-_VARIABLE = ("plant", "data", "noise", "methods", "missions", "control")
-"""Tables that an axis may change; the others are the same at every level."""
-
-
 # Tables of a study ----------------------------------------------------------------------------------------------------
 class FlightChoice(FunctionTable):
     """The flight that is recorded, the table ``[data]``, with all of its arguments, defaults included.
@@ -172,8 +168,9 @@ class Missions(Table):
 
 
 _Cost = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
-_Weights = _Cost | dict[str, _Cost] | None
-_WANTED_WEIGHTS = "a number, or a table of numbers by name, from 0"
+_Weights = Annotated[
+    _Cost | dict[str, _Cost] | None, Field(description="a number, or a table of numbers by name, from 0")
+]
 
 
 class ControlChoice(Table):
@@ -192,9 +189,9 @@ class ControlChoice(Table):
 
     PLACE: ClassVar[str] = "control"
 
-    Q: _Weights = Field(None, description=_WANTED_WEIGHTS)
-    R: _Weights = Field(None, description=_WANTED_WEIGHTS)
-    Qf: _Weights = Field(None, description=_WANTED_WEIGHTS)
+    Q: _Weights = None
+    R: _Weights = None
+    Qf: _Weights = None
     clip: Flag = True
 
     @property
@@ -274,6 +271,9 @@ class Study(Table):
     SettingsError
         A key is missing, unknown or holds something else, or the plant cannot fly a trajectory.
     """
+
+    kind: ClassVar[Kind] = STUDY
+    """Kind of the store."""
 
     name: Text
     description: Text = ""
@@ -358,9 +358,10 @@ class Study(Table):
 
         Raises SettingsError: the path leads to a table that is the same at every level.
         """
+        variable = ("plant", "data", "noise", "methods", "missions", "control")
         root, *way = path.split(".")
-        if root not in _VARIABLE or not way:
-            raise SettingsError(f'"{path}" cannot vary; there are {", ".join(f"{name}.*" for name in _VARIABLE)}')
+        if root not in variable or not way:
+            raise SettingsError(f'"{path}" cannot vary; there are {", ".join(f"{name}.*" for name in variable)}')
         if root == "methods" and way[1:] == ["preset"]:
             raise SettingsError(f'"{path}" cannot vary: levels change settings; give two methods, a preset each')
         return root != "methods" or way[0] in self.methods
@@ -394,11 +395,6 @@ class Study(Table):
         )
 
     # Members of `Work` -----------------------------------------------------------------------------------------------
-    @property
-    def kind(self) -> Kind:
-        """Kind of the store."""
-        return STUDY
-
     @property
     def asked(self) -> dict[Key, tuple[str | None, ...]]:
         """Level, trial and method of each row.  Raises SettingsError: there are too many."""

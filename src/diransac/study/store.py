@@ -34,19 +34,7 @@ from diransac.errors import StudyError
 from diransac.plain_data import json_data
 from diransac.plain_text import one_line
 
-__all__ = [
-    "AGAIN",
-    "FLEET",
-    "LARGEST",
-    "STUDY",
-    "Key",
-    "Kind",
-    "Store",
-    "Work",
-    "damage",
-    "quoted",
-    "word",
-]
+__all__ = ["AGAIN", "FLEET", "LARGEST", "STUDY", "Key", "Kind", "Store", "Work", "damage", "quoted", "word"]
 
 Key = tuple[Any, ...]
 """Values of the columns that name a row."""
@@ -62,10 +50,6 @@ _FORMAT = 3
 
 _TIMEOUT = 120.0
 """s to wait while another process writes, and that one query may take."""
-
-_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
-           NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
-"""Errors of values that a store of diransac never holds."""
 
 
 @dataclass(frozen=True)
@@ -231,18 +215,20 @@ class Store:
 
     def finished(self, keys: Iterable[Key] | None = None) -> set[Key]:
         """Those of some rows, or of all, that are present."""
-        names = list(self.kind.key)
-        query = f"SELECT {', '.join(names)} FROM trials"
+        query = f"SELECT {', '.join(self.kind.key)} FROM trials"
         if keys is None:
             return set(self.select(query))
-        one = f"{query} WHERE {' AND '.join(f'{name} = ?' for name in names)}"
-        return {found for key in keys for found in self.select(one, key)}
+        return {found for key in keys for found in self.select(f"{query} {self._of_key}", key)}
 
     def forget(self, keys: Iterable[Key]) -> None:
         """Delete rows, which are then computed anew."""
-        where = " AND ".join(f"{name} = ?" for name in self.kind.key)
         with self._transaction():
-            self._connection.executemany(f"DELETE FROM trials WHERE {where}", list(keys))
+            self._connection.executemany(f"DELETE FROM trials {self._of_key}", list(keys))
+
+    @property
+    def _of_key(self) -> str:
+        """Clause for the row of a key."""
+        return f"WHERE {' AND '.join(f'{name} = ?' for name in self.kind.key)}"
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> int:
         """Number of new rows, written in one transaction; rows that are present stay as they are."""
@@ -316,7 +302,8 @@ def damage(path: Path) -> Iterator[None]:
     """Context in which values of a store are used.  Raises StudyError: one is none that diransac writes."""
     try:
         yield
-    except _DAMAGE as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, EOFError,
+            NotImplementedError, zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
         reason = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise StudyError(f'store "{path}" is damaged: {reason:.200}; begin a new one') from error
 

@@ -27,35 +27,18 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
+from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from diransac.errors import SettingsError
 from diransac.limits import MOST_COUNTED
 
 __all__ = [
-    "RANDOM",
-    "Count",
-    "Flag",
-    "FunctionTable",
-    "OneOf",
-    "Table",
-    "Text",
-    "Whole",
-    "changed",
-    "check_signature",
-    "check_whole",
-    "flat",
-    "function_arguments",
-    "is_number",
-    "takes_options",
-    "unknown_key",
+    "RANDOM", "Count", "Flag", "FunctionTable", "OneOf", "Table", "Text", "Whole", "changed", "check_signature",
+    "check_whole", "flat", "function_arguments", "is_number", "takes_options", "unknown_key",
 ]  # fmt: skip
 
 RANDOM = "random"
 """Value of an argument that is drawn anew for each trial."""
-
-_OWN_WORDS = "own_words"
-"""Type of a validation error whose message says what to give."""
 
 # The description of a type is what its error message asks for.
 Text = Annotated[StrictStr, Field(description="text")]
@@ -98,12 +81,12 @@ class Table(BaseModel):
         if error["type"] == "extra_forbidden":
             keys = sorted(by_key, key=lambda name: not by_key[name].is_required())
             return unknown_key(place, key, keys)
-        choices = [one.choices for one in by_key[key].metadata if isinstance(one, OneOf)]
-        wanted = f"one of {', '.join(choices[0])}" if choices else by_key[key].description or "a table"
+        known = [", ".join(one.choices) for one in by_key[key].metadata if isinstance(one, OneOf)]
+        wanted = f"one of {known[0]}" if known else by_key[key].description or "a table"
         if error["type"] == "missing":
             there = f"there are {', '.join(table)}" if table else "there is nothing"
             return f'the key "{path}", which is to hold {wanted}, is missing; in {place or "this study"} {there}'
-        what_to_do = error["msg"] if error["type"] == _OWN_WORDS else f"give {wanted}"
+        what_to_do = error["ctx"]["error"] if error["type"] == "value_error" else f"give {wanted}"
         is_element = len(error["loc"]) > 1 and isinstance(error["loc"][1], int)
         return f"{path} {'has' if is_element else 'is'} {found!r:.60}; {what_to_do}"
 
@@ -141,7 +124,7 @@ class OneOf:
 
     def _check(self, text: str) -> str:
         if text not in self.choices:
-            raise PydanticCustomError(_OWN_WORDS, "there are {choices}", {"choices": ", ".join(self.choices)})
+            raise ValueError(f"there are {', '.join(self.choices)}")
         return text
 
 
@@ -167,16 +150,18 @@ class FunctionTable(Table):
 
 
 # Arguments of a function ----------------------------------------------------------------------------------------------
-_VARIABLE = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+def _named(signature: inspect.Signature) -> list[inspect.Parameter]:
+    """Arguments other than ``*more`` and ``**options``."""
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [one for one in signature.parameters.values() if one.kind not in variable]
 
 
 def check_signature(function: Callable[..., Any], name: str) -> None:
     """Raises SettingsError: an argument of a user's function has no default, or one that TOML cannot hold."""
     try:
-        signature = inspect.signature(function)
+        parameters = _named(inspect.signature(function))
     except (TypeError, ValueError) as error:
         raise SettingsError(f'"{name}" has no signature that can be read; wrap it in a function') from error
-    parameters = [one for one in signature.parameters.values() if one.kind not in _VARIABLE]
     needed = [one.name for one in parameters if one.default is one.empty]
     if needed:
         raise SettingsError(f'"{name}" needs {", ".join(needed)}; give every argument a default')
@@ -213,19 +198,17 @@ def function_arguments(
     SettingsError
         An unknown key, or a value that is not of its default's kind.
     """
-    defaults = {
-        name: _as_written(one.default)
-        for name, one in inspect.signature(function).parameters.items()
-        if one.kind not in _VARIABLE and one.default is not None and one.default is not one.empty
-    }
+    named = _named(inspect.signature(function))
+    parameters = {x.name: x for x in named if x.default is not None and x.default is not x.empty}
     for name in given:
-        if name not in defaults:
-            raise SettingsError(unknown_key(place, name, [*keys, *defaults]))
+        if name not in parameters:
+            raise SettingsError(unknown_key(place, name, [*keys, *parameters]))
     found = {}
-    for name, default in defaults.items():
+    for name, one in parameters.items():
+        default = _as_written(one.default)
         value = given.get(name, default)
         # Annotations of arguments that are counts; a default of 0 alone may stand for 0.0.
-        is_count = inspect.signature(function).parameters[name].annotation in (int, "int")
+        is_count = one.annotation in (int, "int")
         drawn = name == random and value == RANDOM
         wanted = None if drawn else _unfit(value, default, is_count, pairs)
         if wanted:

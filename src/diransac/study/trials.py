@@ -38,6 +38,7 @@ from diransac.study.data import (
     check_ended,
     derived_seed,
     flown,
+    together,
     trial_data_batch,
     trial_seed,
 )
@@ -172,12 +173,20 @@ class _Point:
         by_trial: dict[int, list[_Case]] = defaultdict(list)
         for case in cases:
             by_trial[case.trial].append(case)
-        begin = time.perf_counter()
-        found = trial_data_batch(self.study, self.level, list(by_trial))
-        for some, data in zip(by_trial.values(), found, strict=True):
-            for case in some:
-                case.receive(data)
-        _share(cases, "record", time.perf_counter() - begin)
+        with _timed(cases, "record"):
+            found = trial_data_batch(self.study, self.level, list(by_trial))
+            for some, data in zip(by_trial.values(), found, strict=True):
+                for case in some:
+                    case.receive(data)
+
+
+@contextmanager
+def _timed(cases: Sequence[_Case], stage: str) -> Iterator[None]:
+    """Divide the time of the block equally among cases."""
+    begin = time.perf_counter()
+    yield
+    for case in cases:
+        case.seconds[stage] += (time.perf_counter() - begin) / len(cases)
 
 
 @dataclass
@@ -202,12 +211,11 @@ class _Case:
     @contextmanager
     def attempt(self, stage: str) -> Iterator[None]:
         """Add the time of the block to a stage, and its error to the row; other cases go on."""
-        begin = time.perf_counter()
-        try:
-            yield
-        except Exception as error:  # noqa: BLE001  one failed trial must not end a long study; its row says what it was
-            self.fail(error)
-        self.seconds[stage] += time.perf_counter() - begin
+        with _timed([self], stage):
+            try:
+                yield
+            except Exception as error:  # noqa: BLE001  one failed trial must not end a long study; its row says it
+                self.fail(error)
 
     def fail(self, error: Exception) -> None:
         """Add an error to the row."""
@@ -290,10 +298,9 @@ def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     planned = [case for case in cases if id(case) in plans]
     controllers = _controllers(planned, plans, point.study.control)
     steered = [case for case in planned if id(case) in controllers]
-    begin = time.perf_counter()
-    seeds = [derived_seed(case.seed, shape) for case in steered]
-    logs = flown(point.plant, [controllers[id(case)] for case in steered], seeds)
-    _share(steered, "fly", time.perf_counter() - begin)
+    with _timed(steered, "fly"):
+        seeds = [derived_seed(case.seed, shape) for case in steered]
+        logs = flown(point.plant, [controllers[id(case)] for case in steered], seeds)
     for case, log in zip(steered, logs, strict=True):
         with case.attempt("fly"):
             case.assess(shape, plans[id(case)], log)
@@ -338,10 +345,9 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
 
 def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice) -> dict[int, Controller]:
     """Controller of each case that has one."""
-    begin = time.perf_counter()
-    plants = [case.found for case in cases if case.found is not None]
-    steering = _steering(plants, [plans[id(case)] for case in cases], control.weights)
-    _share(cases, "steer", time.perf_counter() - begin)
+    with _timed(cases, "steer"):
+        steer = partial(tvlqr_batch, **control.weights, threads=1)
+        steering = together(steer, [case.found for case in cases], [plans[id(case)] for case in cases])
     found = {}
     for case, one in zip(cases, steering, strict=True):
         if isinstance(one, Exception):
@@ -349,18 +355,6 @@ def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: 
         else:
             found[id(case)] = control.limited(one)
     return found
-
-
-def _steering(
-    plants: Sequence[Plant], plans: Sequence[Trajectory], weights: Mapping[str, Any]
-) -> Sequence[Controller | Exception]:
-    """Controllers, or their errors: all in one sweep, or each on its own if that fails."""
-    try:
-        return tvlqr_batch(plants, plans, **weights, threads=1)
-    except Exception as error:  # noqa: BLE001  its row says what it was; other flights go on
-        if len(plants) == 1:
-            return [error]
-        return [_steering([plant], [plan], weights)[0] for plant, plan in zip(plants, plans, strict=True)]
 
 
 # Values of a row ----------------------------------------------------------------------------------------------------
@@ -371,12 +365,6 @@ def _ends(intervals: Mapping[str, tuple[float, float]]) -> dict[str, float]:
         if np.isfinite([low, high]).all():
             found |= {f"low_{name}": low, f"high_{name}": high}
     return found
-
-
-def _share(cases: Sequence[_Case], stage: str, seconds: float) -> None:
-    """Divide a time equally among cases."""
-    for case in cases:
-        case.seconds[stage] += seconds / len(cases)
 
 
 def _plain(value: Any) -> float | int | str | None:
@@ -396,8 +384,5 @@ def _packed(paths: dict[str, Any]) -> bytes:
 @lru_cache(maxsize=1)
 def versions() -> str:
     """Versions of Python and of the packages that results depend on."""
-    found = [
-        ("python", platform.python_version()),
-        *((name, version(name)) for name in ("diransac", "casadi", "llvmlite", "numpy", "scipy")),
-    ]
-    return " ".join(f"{name} {number}" for name, number in found)
+    packages = ("diransac", "casadi", "llvmlite", "numpy", "scipy")
+    return " ".join([f"python {platform.python_version()}", *(f"{name} {version(name)}" for name in packages)])

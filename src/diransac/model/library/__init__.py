@@ -5,17 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from diransac.errors import ModelError
-from diransac.model.library.cart_pole import cart_pole
-from diransac.model.library.dc_motor import dc_motor
-from diransac.model.library.differential_drive import differential_drive
-from diransac.model.library.double_pendulum import double_pendulum
-from diransac.model.library.extended_rotorcraft import BLADE_FLAPPING, TABLE_I, extended_rotorcraft
-from diransac.model.library.flexible_joint import flexible_joint
-from diransac.model.library.planar_rotorcraft import planar_rotorcraft
+from diransac.model.library.drives import dc_motor, flexible_joint, servo_axis
+from diransac.model.library.pendulums import cart_pole, double_pendulum
 from diransac.model.library.quadrotor import quadrotor
-from diransac.model.library.servo_axis import servo_axis
-from diransac.model.library.single_track_vehicle import single_track_vehicle
-from diransac.model.library.underwater_vehicle import underwater_vehicle
+from diransac.model.library.rotorcraft import BLADE_FLAPPING, TABLE_I, extended_rotorcraft, planar_rotorcraft
+from diransac.model.library.vehicles import differential_drive, single_track_vehicle, underwater_vehicle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,28 +19,11 @@ if TYPE_CHECKING:
     from diransac.model.robots import body_position, coordinates_of_bodies, drive_forces, robot, robot_limits
 
 __all__ = [
-    "BLADE_FLAPPING",
-    "BUILTIN",
-    "TABLE_I",
-    "body_position",
-    "builtin",
-    "cart_pole",
-    "coordinates_of_bodies",
-    "dc_motor",
-    "differential_drive",
-    "double_pendulum",
-    "drive_forces",
-    "extended_rotorcraft",
-    "flexible_joint",
-    "mujoco",
-    "planar_rotorcraft",
-    "quadrotor",
-    "robot",
-    "robot_limits",
-    "servo_axis",
-    "single_track_vehicle",
+    "BLADE_FLAPPING", "BUILTIN", "TABLE_I", "body_position", "builtin", "cart_pole", "coordinates_of_bodies",
+    "dc_motor", "differential_drive", "double_pendulum", "drive_forces", "extended_rotorcraft", "flexible_joint",
+    "mujoco", "planar_rotorcraft", "quadrotor", "robot", "robot_limits", "servo_axis", "single_track_vehicle",
     "underwater_vehicle",
-]
+]  # fmt: skip
 
 BUILTIN: dict[str, Callable[[], Model]] = {
     "planar-rotorcraft": planar_rotorcraft,

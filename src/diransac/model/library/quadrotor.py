@@ -11,7 +11,7 @@ from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
-from diransac.model.sensors import Sensor, accelerometer, gyroscope
+from diransac.model.sensors import accelerometer, gyroscope
 
 __all__ = ["quadrotor"]
 
@@ -19,14 +19,6 @@ Rotor = tuple[float, float, int]
 
 _AXES, _ATTITUDE = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _VELOCITY, _RATES = ("vx", "vy", "vz"), ("wx", "wy", "wz")
-_DIAGONAL = 1.0 / sqrt(2.0)
-_LAYOUTS: dict[str, tuple[Rotor, ...]] = {
-    "x": tuple(
-        (_DIAGONAL * x, _DIAGONAL * y, spin) for x, y, spin in ((1, -1, 1), (-1, 1, 1), (1, 1, -1), (-1, -1, -1))
-    ),
-    "+": ((0, -1, 1), (0, 1, 1), (1, 0, -1), (-1, 0, -1)),
-}
-"""Positions in arm lengths and directions of rotation, in PX4's order of motors."""
 
 
 def quadrotor(
@@ -89,6 +81,11 @@ def quadrotor(
     names = [f"motor{i + 1}" for i in range(len(layout))]
     states = [f"speed{i + 1}" for i in range(len(layout))] if motor_lag else []
 
+    down = (0.0, 0.0, -gravity)
+    imu_sensors = (
+        accelerometer(_VELOCITY, _ATTITUDE, gravity=down, axes=_AXES) | gyroscope(_RATES, axes=_AXES) if imu else None
+    )
+
     def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
         squares = [v[n] ** 2 for n in states] if motor_lag else [u[n] ** 2 for n in names]
         lag = [p.motor_time_constant * a[n] + v[n] - u[command] for n, command in zip(states, names, strict=False)]
@@ -104,16 +101,22 @@ def quadrotor(
         inputs=dict.fromkeys(names, speed_unit),
         parameters=_parameters(speed_unit, motor_lag),
         equations=equations,
-        sensors=_imu(gravity) if imu else None,
+        sensors=imu_sensors,
     )
 
 
 def _layout(rotors: str | Sequence[Rotor], arm_length: float) -> tuple[Rotor, ...]:
     """Position, m, and direction of each rotor."""
     if isinstance(rotors, str):
-        if rotors not in _LAYOUTS:
+        if rotors not in ("x", "+"):
             raise ModelError(f'rotors = {rotors!r}; choose "x", "+", or a sequence of (x, y, direction)')
-        return tuple((arm_length * x, arm_length * y, spin) for x, y, spin in _LAYOUTS[rotors])
+        # In PX4's order of motors.
+        corners, arms = ((1, -1), (-1, 1), (1, 1), (-1, -1)), ((0, -1), (0, 1), (1, 0), (-1, 0))
+        places, scale = (corners, 1.0 / sqrt(2.0)) if rotors == "x" else (arms, 1.0)
+        return tuple(
+            (arm_length * (scale * x), arm_length * (scale * y), spin)
+            for (x, y), spin in zip(places, (1, 1, -1, -1), strict=True)
+        )
     for rotor in rotors:
         x, y, spin = rotor
         if not (isfinite(x) and isfinite(y)) or spin not in (1, -1):
@@ -124,28 +127,13 @@ def _layout(rotors: str | Sequence[Rotor], arm_length: float) -> tuple[Rotor, ..
     return tuple(rotors)
 
 
-def _imu(gravity: float) -> dict[str, Sensor]:
-    """Accelerometer and gyroscope in the body frame."""
-    return {
-        **accelerometer(_VELOCITY, _ATTITUDE, gravity=(0.0, 0.0, -gravity), axes=_AXES),
-        **gyroscope(_RATES, axes=_AXES),
-    }
-
-
 def _parameters(speed_unit: str, motor_lag: bool) -> dict[str, Parameter]:
     """Parameters by name."""
     squared = "" if speed_unit == "1" else f"/({speed_unit})^2"
-    positive = {
-        "mass": "kg",
-        **dict.fromkeys(("inertia_x", "inertia_y", "inertia_z"), "kg m^2"),
-        "thrust_coefficient": f"N{squared}",
-        "torque_coefficient": f"N m{squared}",
-        **({"motor_time_constant": "s"} if motor_lag else {}),
-    }
-    return {
-        **{n: Parameter(unit, positive=True) for n, unit in positive.items()},
-        "drag": Parameter("N s/m", lower=0.0),
-    }
+    positive = {"mass": "kg", **dict.fromkeys(("inertia_x", "inertia_y", "inertia_z"), "kg m^2")}
+    positive |= {"thrust_coefficient": f"N{squared}", "torque_coefficient": f"N m{squared}"}
+    positive |= {"motor_time_constant": "s"} if motor_lag else {}
+    return {n: Parameter(unit, positive=True) for n, unit in positive.items()} | {"drag": Parameter("N s/m", lower=0.0)}
 
 
 def _kinematics(q: Symbols, v: Symbols) -> list[object]:
@@ -163,11 +151,7 @@ def _kinematics(q: Symbols, v: Symbols) -> list[object]:
 
 def _forces(q: Symbols, v: Symbols, a: Symbols, p: Symbols, squares: list[SX], gravity: float) -> list[object]:
     """Balance of forces in the world frame, from the squared speeds of the rotors."""
-    up = (
-        2 * (q.qx * q.qz + q.qw * q.qy),
-        2 * (q.qy * q.qz - q.qw * q.qx),
-        1 - 2 * (q.qx**2 + q.qy**2),
-    )
+    up = 2 * (q.qx * q.qz + q.qw * q.qy), 2 * (q.qy * q.qz - q.qw * q.qx), 1 - 2 * (q.qx**2 + q.qy**2)
     velocity = (v.vx, v.vy, v.vz)
     along = sum(e * x for e, x in zip(up, velocity, strict=True))
     thrust = p.thrust_coefficient * sum(squares)

@@ -12,7 +12,7 @@ import numpy as np
 from diransac.errors import ModelError
 from diransac.model.mjcf.masks import FIELDS
 from diransac.model.mjcf.model import write
-from diransac.model.robots.calibration import Document
+from diransac.model.robots.calibration import Document, numbers
 from diransac.model.robots.sizes import check_description
 
 if TYPE_CHECKING:
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from diransac.model.mjcf.model import MujocoModel
 
 __all__ = ["calibrated_text"]
-
-_SECTIONS = {"actuator": "actuator", "tendon": "tendon", "equality": "equality", "pair": "contact"}
-_OF_INERTIA = ("mass", "ipos", "inertia")
 
 
 def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
@@ -71,8 +68,9 @@ def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, f
 def _set(document: Document, compiled: Any, unknown: Unknown, kind: str, name: str) -> None:
     """Write the field of an element."""
     field, _ = unknown.field
-    element = document.named(kind, name, _SECTIONS.get(kind, "worldbody"))
-    if kind == "body" and field in _OF_INERTIA:
+    sections = {"actuator": "actuator", "tendon": "tendon", "equality": "equality", "pair": "contact"}
+    element = document.named(kind, name, sections.get(kind, "worldbody"))
+    if kind == "body" and field in ("mass", "ipos", "inertia"):
         inertial = _inertial(compiled, name)
         if old := [x for x in element.children if x.tag == "inertial"]:
             document.changes[old[0].begin, old[0].end] = inertial
@@ -83,7 +81,7 @@ def _set(document: Document, compiled: Any, unknown: Unknown, kind: str, name: s
     index = getattr(compiled, kind)(name).id
     own = next(x for x in unknown.places if x.array == array and _belongs(compiled, kind, x.array, x.index[0], index))
     row = np.atleast_1d(getattr(compiled, array)[own.index[0]])[first : first + size] / factor
-    document.rewrite(element, {field: " ".join(repr(float(x)) for x in row)})
+    document.rewrite(element, {field: numbers(row)})
 
 
 def _belongs(compiled: Any, kind: str, array: str, row: int, index: int) -> bool:
@@ -97,10 +95,6 @@ def _belongs(compiled: Any, kind: str, array: str, row: int, index: int) -> bool
 def _inertial(compiled: Any, name: str) -> str:
     """Element of a body with its mass and inertia."""
     body = compiled.body(name)
-
-    def numbers(values: Any) -> str:
-        return " ".join(repr(float(x)) for x in np.ravel(values))
-
     inertia = np.ravel(body.inertia)
     if not (inertia.sum() - 2.0 * inertia >= -1e-9 * inertia.sum()).all():
         raise ModelError(f'body "{name}" would have the impossible inertia {numbers(inertia)}; fix one of its entries')

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from diransac.model.robots.actuation import Actuation
 
-__all__ = ["Drives", "JointColumns", "SensorColumns", "compiled_text", "file_drives", "joint_columns", "sensor_columns"]
-
-_FREE, _BALL = 0, 1
+__all__ = [
+    "JointColumns", "SensorColumns", "compiled_of", "compiled_text", "file_drives", "joint_columns", "sensor_columns",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,7 @@ class SensorColumns:
     of_forces: bool
 
 
-@dataclass(frozen=True)
-class Drives:
-    """Inputs of a model, in the order of MuJoCo's controls: unit by name."""
-
-    inputs: dict[str, str]
-
-
-def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, Drives | None]:
+def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, dict[str, str] | None]:
     """A description as one text that MuJoCo reads, without visual shapes and other files; and the drives' inputs.
 
     Parameters
@@ -82,8 +75,8 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, D
     Returns
     -------
     str
-    Drives or None
-        None: the file's actuators.
+    dict of str to str, or None
+        Unit of each input, in the order of MuJoCo's controls; None: the file's actuators.
 
     Raises
     ------
@@ -99,27 +92,28 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, D
     for element in (*spec.skins, *spec.lights, *spec.cameras):
         spec.delete(element)
     drives = None if actuation is None else _with_drives(label, spec, actuation)
-    home = _compiled(label, spec)
+    home = compiled_of(label, spec)
     pose = home.key_qpos[0].copy() if home.nkey else None
     for element in list(spec.keys):
         spec.delete(element)
     if pose is not None:
         spec.add_key(name="home", qpos=pose)
-    compiled = _compiled(label, spec)
+    compiled = compiled_of(label, spec)
     _check_state(label, compiled)
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
-    compiled = _compiled(label, spec)
+    compiled_of(label, spec)
     return str(spec.to_xml()), drives
 
 
-def _compiled(label: str, spec: Any) -> Any:
-    """The compiled model.  Raises ModelError: MuJoCo finds an error."""
+def compiled_of(label: str, source: Any) -> Any:
+    """MuJoCo's model of a text, or of its editable form.  Raises ModelError: MuJoCo finds an error."""
+    mujoco = mujoco_module()
     try:
         with without_warnings():
-            return spec.compile()
-    except (ValueError, mujoco_module().FatalError) as error:
-        raise ModelError(f"{label} cannot be compiled: {' '.join(str(error).split())}") from error
+            return mujoco.MjModel.from_xml_string(source) if isinstance(source, str) else source.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelError(f"{label} cannot be compiled: {' '.join(str(error).split()):.300}") from error
 
 
 def _check_state(label: str, compiled: Any) -> None:
@@ -153,8 +147,8 @@ def _embed(mesh: Any, compiled: Any) -> None:
 # ---------------------------------------------------------------------- drives
 
 
-def _with_drives(label: str, spec: Any, actuation: Actuation) -> Drives:
-    """Replace the actuators of a description, and return the inputs of the new ones."""
+def _with_drives(label: str, spec: Any, actuation: Actuation) -> dict[str, str]:
+    """Replace the actuators of a description, and return the inputs of the new ones, with units."""
     mujoco = mujoco_module()
     is_joint = [x for x in spec.actuators if x.trntype == mujoco.mjtTrn.mjTRN_JOINT]
     driven = {x.target for x in is_joint}
@@ -163,7 +157,8 @@ def _with_drives(label: str, spec: Any, actuation: Actuation) -> Drives:
             spec.delete(element)
     for key in spec.keys:
         key.ctrl = []
-    moved = [x for x in spec.joints if int(x.type) > _BALL and (not driven or x.name in driven)]
+    turn_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    moved = [x for x in spec.joints if x.type in turn_or_slide and (not driven or x.name in driven)]
     if not moved:
         raise ModelError(f"{label}: no hinge or slide has a drive; leave actuation out")
     inputs = dict[str, str]()
@@ -180,7 +175,7 @@ def _with_drives(label: str, spec: Any, actuation: Actuation) -> Drives:
             new.gainprm[0], new.biastype = gain, mujoco.mjtBias.mjBIAS_AFFINE
             new.biasprm[1:3] = bias
         inputs |= own
-    return Drives(inputs)
+    return inputs
 
 
 def _gains(label: str, actuation: Actuation, joint: str) -> list[tuple[float, tuple[float, float]]]:
@@ -199,7 +194,7 @@ def _gains(label: str, actuation: Actuation, joint: str) -> list[tuple[float, tu
     return [*found, (1.0, (0.0, 0.0))] if actuation.feedforward else found
 
 
-def file_drives(compiled: Any, taken: Collection[str]) -> Drives:
+def file_drives(compiled: Any, taken: Collection[str]) -> dict[str, str]:
     """Inputs of the actuators of the file, named after them; one that another signal has is ``<name>_ctrl``."""
     inputs = dict[str, str]()
     for k in range(len(compiled.actuator_trntype)):
@@ -207,7 +202,7 @@ def file_drives(compiled: Any, taken: Collection[str]) -> Drives:
         n = int(compiled.actuator_ctrlnum[k]) if hasattr(compiled, "actuator_ctrlnum") else 1
         name = f"{name}_ctrl" if name in taken else name
         inputs |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
-    return Drives(inputs)
+    return inputs
 
 
 # ---------------------------------------------------------------------- names
@@ -215,19 +210,20 @@ def file_drives(compiled: Any, taken: Collection[str]) -> Drives:
 
 def joint_columns(compiled: Any) -> Iterator[JointColumns]:
     """Coordinates, velocities and accelerations of each joint, in MuJoCo's order."""
+    kinds = mujoco_module().mjtJoint
     for k in range(compiled.njnt):
-        kind, joint = int(compiled.jnt_type[k]), compiled.joint(k)
-        if kind == _FREE:
+        kind, joint = kinds(int(compiled.jnt_type[k])), compiled.joint(k)
+        if kind == kinds.mjJNT_FREE:
             name = identifier(joint.name or compiled.body(compiled.jnt_bodyid[k]).name or f"base_{k}")
             position = {f"{name}_{x}": "m" for x in "xyz"} | {f"{name}_q{x}": "1" for x in "wxyz"}
             velocity = {f"{name}_v{x}": "m/s" for x in "xyz"} | {f"{name}_w{x}": "rad/s" for x in "xyz"}
-        elif kind == _BALL:
+        elif kind == kinds.mjJNT_BALL:
             name = identifier(joint.name or f"joint_{k}")
             position = {f"{name}_q{x}": "1" for x in "wxyz"}
             velocity = {f"{name}_w{x}": "rad/s" for x in "xyz"}
         else:
             name = identifier(joint.name or f"joint_{k}")
-            unit = "m" if kind == 2 else "rad"
+            unit = "m" if kind == kinds.mjJNT_SLIDE else "rad"
             position, velocity = {name: unit}, {f"{name}_dot": f"{unit}/s"}
             yield JointColumns(name, position, velocity, (f"{name}_ddot",))
             continue
@@ -240,9 +236,6 @@ _UNITS = {
     "FRAMELINVEL": "m/s", "FRAMEANGVEL": "rad/s", "FRAMELINACC": "m/s^2", "FRAMEANGACC": "rad/s^2",
     "SUBTREECOM": "m", "SUBTREELINVEL": "m/s",
 }  # fmt: skip
-
-
-_ENDS = {1: [""], 3: ["_x", "_y", "_z"], 4: ["_qw", "_qx", "_qy", "_qz"]}
 
 
 def sensor_columns(compiled: Any, states: Collection[str]) -> Iterator[SensorColumns]:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.errors import ModelError, ResultError
-from diransac.model.mjcf.description import compiled_text, file_drives, joint_columns, sensor_columns
+from diransac.errors import ModelError
+from diransac.model.mjcf.description import compiled_of, compiled_text, file_drives, joint_columns, sensor_columns
 from diransac.model.mjcf.masks import ARRAYS, Place, Unknown, unknowns_of
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
-from diransac.model.robots.description import mujoco_module, without_warnings
+from diransac.model.robots.description import mujoco_module
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text
 
@@ -25,11 +23,7 @@ if TYPE_CHECKING:
     from diransac.model.mjcf.description import JointColumns, SensorColumns
     from diransac.model.robots.actuation import Actuation
 
-__all__ = ["SIMULATOR", "MujocoModel", "mujoco"]
-
-_OF_EQUATIONS = ("residual", "measurement", "_probe", "_mass_matrix", "_bias", "_definite", "_equations_data")
-SIMULATOR = "mujoco"
-"""What marks a stored model as one of this kind."""
+__all__ = ["MujocoModel", "mujoco"]
 
 
 def mujoco(
@@ -78,11 +72,11 @@ def mujoco(
     """
     text, drives = compiled_text(path, actuation)
     label = f'robot description "{path}"'
-    compiled = _compiled(label, text)
+    compiled = compiled_of(label, text)
     states = [n for x in joint_columns(compiled) for n in (*x.coordinates, *x.velocities)]
     sensors = list(sensor_columns(compiled, states))
     unknowns = unknowns_of(label, compiled, sensors, (unknown,) if isinstance(unknown, str) else tuple(unknown))
-    inputs = (drives or file_drives(compiled, states)).inputs
+    inputs = file_drives(compiled, states) if drives is None else drives
     return MujocoModel(name or identifier(Path(path).stem), text, unknowns, inputs)
 
 
@@ -119,7 +113,7 @@ class MujocoModel(Model):
         sensors: Collection[str] | None = None,
     ) -> None:
         self.text, self.unknowns, self.constants = text, tuple(unknowns), tuple(constants)
-        compiled = _compiled(f'model "{name}"', text)
+        compiled = compiled_of(f'model "{name}"', text)
         joints: list[JointColumns] = list(joint_columns(compiled))
         coordinates = {n: unit for x in joints for n, unit in x.coordinates.items()}
         velocities = {n: unit for x in joints for n, unit in x.velocities.items()}
@@ -131,16 +125,15 @@ class MujocoModel(Model):
         taken = {n: unit for n, unit in readings.items() if n not in inputs}
         self.kinematics = None if derived else self._rates_of_coordinates  # type: ignore[assignment]
         self._name_signals(name, coordinates, inputs, parameters, None if derived else velocities, {}, "", taken)
-        units = {n: _derivative(unit) for n, unit in self.velocities.items()}
         names = [n for x in joints for n in x.accelerations]
-        self.accelerations = dict(zip(names, units.values(), strict=True))
+        self.accelerations = dict(zip(names, self.accelerations.values(), strict=True))
 
     # ------------------------------------------------------------------ what the simulator reads
 
     @cached_property
     def compiled(self) -> Any:
         """MuJoCo's model, with the constants in it."""
-        found = _compiled(self._label, self.text)
+        found = compiled_of(self._label, self.text)
         for unknown, value in self.constants:
             write(found, unknown.places, value)
         self.complete(found, mujoco_module().MjData(found))
@@ -202,7 +195,7 @@ class MujocoModel(Model):
 
     def __getattr__(self, name: str) -> Any:
         """Raises ModelError where equations are asked for."""
-        if name in _OF_EQUATIONS:
+        if name in ("residual", "measurement", "force_sign", "_probe", "_mass_matrix", "_bias", "_equations_data"):
             raise ModelError(f"{self._label} has no equations, which this needs: MuJoCo simulates it")
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
@@ -287,10 +280,10 @@ class MujocoModel(Model):
 
     # ------------------------------------------------------------------ identity and storage
 
-    def to_dict(self) -> dict[str, Any]:
-        """Text, parameters and names as JSON data, which `from_dict` reads."""
-        data = {
-            "simulator": SIMULATOR,
+    def _to_dict(self) -> dict[str, Any]:
+        """Text, parameters and names."""
+        return {
+            "simulator": "mujoco",
             "name": self.name,
             "mjcf": self.text,
             "unknowns": [_stored(x) for x in self.unknowns],
@@ -298,35 +291,22 @@ class MujocoModel(Model):
             "inputs": dict(self.inputs),
             "sensors": None if self._given_sensors is None else list(self._given_sensors),
         }
-        return {**data, "checksum": _checksum(data)}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> MujocoModel:
-        """The model that `to_dict` wrote.  Raises ResultError: the data are damaged."""
-        try:
-            if data["checksum"] != _checksum({k: x for k, x in data.items() if k != "checksum"}):
-                raise ResultError("the stored model is damaged: its checksum does not match; identify again")
-            check_text(str(data["mjcf"]).encode(), "the stored model")
-            model = cls(
-                str(data["name"]),
-                str(data["mjcf"]),
-                [_restored(x) for x in data["unknowns"]],
-                {str(n): str(unit) for n, unit in data["inputs"].items()},
-                constants=[(_restored(x), float(value)) for x, value in data["constants"]],
-                sensors=None if data["sensors"] is None else [str(n) for n in data["sensors"]],
-            )
-            for unknown in (*model.unknowns, *(x for x, _ in model.constants)):
-                for place in unknown.places:
-                    getattr(model.compiled, place.array)[place.index]
-        except (LookupError, TypeError, AttributeError, ValueError, ModelError) as error:
-            reason = str(error).partition("\n")[0]
-            raise ResultError(
-                f"the stored model is damaged: {type(error).__name__}: {reason:.200}; identify again"
-            ) from error
+    def _from_checked(cls, data: Mapping[str, Any]) -> Self:
+        check_text(str(data["mjcf"]).encode(), "the stored model")
+        model = cls(
+            str(data["name"]),
+            str(data["mjcf"]),
+            [_restored(x) for x in data["unknowns"]],
+            {str(n): str(unit) for n, unit in data["inputs"].items()},
+            constants=[(_restored(x), float(value)) for x, value in data["constants"]],
+            sensors=None if data["sensors"] is None else [str(n) for n in data["sensors"]],
+        )
+        for unknown in (*model.unknowns, *(x for x, _ in model.constants)):
+            for place in unknown.places:
+                getattr(model.compiled, place.array)[place.index]
         return model
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (MujocoModel.from_dict, (self.to_dict(),))
 
     def __repr__(self) -> str:
         return f"MujocoModel({self.name!r}, coordinates={list(self.coordinates)}, parameters={list(self.parameters)})"
@@ -345,21 +325,6 @@ def write(compiled: Any, places: Sequence[Place], value: float) -> None:
         getattr(compiled, place.array)[place.index] = place.factor * value
 
 
-def _compiled(label: str, text: str) -> Any:
-    """MuJoCo's model of a text.  Raises ModelError: it is none."""
-    module = mujoco_module()
-    try:
-        with without_warnings():
-            return module.MjModel.from_xml_string(text)
-    except ValueError as error:
-        raise ModelError(f"{label} cannot be compiled: {' '.join(str(error).split()):.300}") from error
-
-
-def _derivative(unit: str) -> str:
-    head, _, tail = unit.partition("/")
-    return f"{head}/s^2" if tail == "s" else f"{unit}/s"
-
-
 def _stored(unknown: Unknown) -> dict[str, Any]:
     places = [[x.array, list(x.index), x.factor] for x in unknown.places]
     columns, elements = list(unknown.columns), [list(x) for x in unknown.elements]
@@ -375,7 +340,3 @@ def _restored(data: Mapping[str, Any]) -> Unknown:
     elements = tuple((str(kind), str(name)) for kind, name in data["elements"])
     parameter = Parameter.from_dict(data["parameter"])
     return Unknown(str(data["name"]), parameter, tuple(places), elements, tuple(map(str, data["columns"])))
-
-
-def _checksum(data: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()

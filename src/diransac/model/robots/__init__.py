@@ -4,13 +4,6 @@ from diransac.model.robots.actuation import Actuation, JointTorques, MotorCurren
 from diransac.model.robots.robot import body_position, coordinates_of_bodies, robot, robot_limits
 
 __all__ = [
-    "Actuation",
-    "JointTorques",
-    "MotorCurrents",
-    "PositionControl",
-    "body_position",
-    "coordinates_of_bodies",
-    "drive_forces",
-    "robot",
-    "robot_limits",
-]
+    "Actuation", "JointTorques", "MotorCurrents", "PositionControl", "body_position", "coordinates_of_bodies",
+    "drive_forces", "robot", "robot_limits",
+]  # fmt: skip

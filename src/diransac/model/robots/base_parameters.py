@@ -16,9 +16,6 @@ from diransac.arrays import FloatArray
 
 __all__ = ["Grouping", "base_parameters"]
 
-_ZERO = 1e-9
-"""Size of a column relative to the largest, and of weights between columns of unit length, that is a rounding error."""
-
 
 @dataclass(frozen=True)
 class Grouping:
@@ -59,6 +56,8 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
         Seed of the random motions.
     """
     n, n_x = regressor.size1_in(0), regressor.size2_out(0)
+    # Rounding error of a column relative to the largest, and of weights between columns of unit length.
+    rounding = 1e-9
     rng = np.random.default_rng(seed)
     n_points = 3 * n_x // n + 10
     sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
@@ -71,12 +70,12 @@ def base_parameters(regressor: ca.Function, seed: int = 0) -> Grouping:
     stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
     Y = np.vstack(stacked)
     lengths = np.linalg.norm(Y, axis=0)
-    seen = lengths > _ZERO * lengths.max()
+    seen = lengths > rounding * lengths.max()
     Y, lengths = np.where(seen, Y / np.where(seen, lengths, 1.0), 0.0), np.where(seen, lengths, 1.0)
     kept = _independent_columns(Y)
     dropped = tuple(k for k in range(n_x) if k not in kept)
     weights = np.linalg.lstsq(Y[:, kept], Y[:, dropped])[0] if kept and dropped else np.zeros((len(kept), len(dropped)))
-    weights[np.abs(weights) < _ZERO] = 0.0
+    weights[np.abs(weights) < rounding] = 0.0
     weights *= lengths[list(dropped)] / lengths[kept, None]
     # Decimal digits of weights, which are products of lengths in m.
     return Grouping(tuple(kept), dropped, np.round(weights, 10))

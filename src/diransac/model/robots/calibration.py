@@ -18,9 +18,7 @@ from diransac.model.robots.consistency import consistent_parameters, inconsisten
 from diransac.model.robots.description import Description, Joint, read_description
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 
-__all__ = ["Document", "calibrated", "impossible_changes"]
-
-_MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
+__all__ = ["Document", "calibrated", "impossible_changes", "numbers"]
 
 
 def calibrated(
@@ -59,7 +57,8 @@ def calibrated(
     found = _estimates(description, parameters, values, covariance)
     document = Document(source, f'robot description "{path}"')
     # Attributes of a joint, and of a URDF joint's dynamics, by parameter.
-    attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else _MJCF
+    of_mjcf = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
+    attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else of_mjcf
     for name, of_joint in found.joints.items():
         joint = next(x for x in description.joints if x.name == name)
         document.set_joint(joint, {attributes[kind]: x for kind, x in of_joint.items() if kind in attributes})
@@ -310,19 +309,20 @@ def _attributes(texts: Mapping[str, str]) -> str:
     return " ".join(f"{key}={quoteattr(text)}" for key, text in texts.items())
 
 
-def _numbers(values: FloatArray) -> str:
-    return " ".join(repr(float(x)) for x in values)
+def numbers(values: FloatArray) -> str:
+    """Numbers with all of their digits."""
+    return " ".join(repr(float(x)) for x in np.ravel(values))
 
 
 def _mjcf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
     """Element of a body, with the inertia about the centre of mass, xx yy zz xy xz yz."""
-    return f'<inertial pos="{_numbers(centre)}" mass="{mass!r}" fullinertia="{_numbers(inertia)}"/>'
+    return f'<inertial pos="{numbers(centre)}" mass="{mass!r}" fullinertia="{numbers(inertia)}"/>'
 
 
 def _urdf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
     """Element of a link, with the inertia about the centre of mass, xx yy zz xy xz yz."""
     entries = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), inertia.tolist(), strict=True)
     return (
-        f'<inertial><origin xyz="{_numbers(centre)}" rpy="0 0 0"/><mass value="{mass!r}"/>'
+        f'<inertial><origin xyz="{numbers(centre)}" rpy="0 0 0"/><mass value="{mass!r}"/>'
         f"<inertia {_attributes({key: repr(x) for key, x in entries})}/></inertial>"
     )

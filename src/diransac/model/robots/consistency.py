@@ -24,12 +24,6 @@ from diransac.model.robots.rigid_body import inertial_parameters, pseudo_inertia
 
 __all__ = ["consistent_parameters", "inconsistency"]
 
-_LEAST_MOMENT = 1e-6
-"""Second moments of thin bodies, whose pseudo-inertia is singular, relative to the mean one."""
-
-_ANY_BODY = (1.0, 0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0)
-"""A possible body, from which the search for others begins."""
-
 _BASIS = [np.array(ca.DM(pseudo_inertia([float(i == k) for i in range(10)]))) for k in range(10)]
 
 
@@ -85,8 +79,10 @@ def inconsistency(combinations: FloatArray, n_bodies: int, values: FloatArray, c
     (n_b,) array
         Near 0 where the estimates are those of possible bodies.
     """
-    bodies, n_constants = np.tile(_ANY_BODY, (n_bodies, 1)), combinations.shape[1] - 10 * n_bodies
-    problem = _Problem(bodies, np.full(n_constants, _ANY_BODY[4]), combinations, values, covariance)
+    moment, n_constants = 0.01, combinations.shape[1] - 10 * n_bodies
+    # A possible body, from which the search for others begins.
+    bodies = np.tile([1.0, 0.0, 0.0, 0.0, moment, moment, moment, 0.0, 0.0, 0.0], (n_bodies, 1))
+    problem = _Problem(bodies, np.full(n_constants, moment), combinations, values, covariance)
     # Weight of the divergence where only the error counts.
     change = combinations @ _solution(problem, 1e-3) - values
     return np.asarray(change / np.sqrt(np.diag(covariance)))
@@ -199,11 +195,12 @@ def _regular(J: FloatArray) -> FloatArray:
     centre = J[:3, 3] / mass if mass > 0.0 else np.full(3, np.nan)
     moments = J[:3, :3] - mass * np.outer(centre, centre)
     mean = np.trace(moments) / 3.0
-    if not (mass > 0.0 and mean > 0.0 and np.linalg.eigvalsh(moments)[0] > -_LEAST_MOMENT * mean):
+    least = 1e-6 * mean  # of thin bodies, whose pseudo-inertia is singular
+    if not (mass > 0.0 and mean > 0.0 and np.linalg.eigvalsh(moments)[0] > -least):
         raise ModelError(
             f"a body with mass {mass:g} kg and inertia {inertial_parameters(J)[4:7]} kg m^2 about its origin is "
             "impossible: give it a positive mass, and principal inertias that satisfy the triangle inequality"
         )
     thicker = J.copy()
-    thicker[:3, :3] += 2.0 * _LEAST_MOMENT * mean * np.eye(3)
+    thicker[:3, :3] += 2.0 * least * np.eye(3)
     return thicker

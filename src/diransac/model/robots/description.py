@@ -31,9 +31,6 @@ _ALONE = threading.Lock()
 _FAILURES = (ValueError, RuntimeError, MemoryError)
 """Errors of MuJoCo's reader and compiler."""
 
-_LARGEST = 1e50
-"""Of masses, lengths and coefficients; products of several of them do not overflow."""
-
 
 @dataclass(frozen=True)
 class Joint:
@@ -294,8 +291,9 @@ def _check_supported(label: str, model: Any) -> None:
     """Raises ModelError: the robot has parts for which there are no equations here, or numbers that overflow."""
     of_bodies = (model.body_mass, model.body_inertia, model.body_ipos, model.body_pos)
     of_joints = (model.dof_armature, model.dof_damping, model.dof_frictionloss, model.jnt_stiffness, model.jnt_pos)
-    if not all(np.all(np.abs(x) < _LARGEST) for x in (*of_bodies, *of_joints)):
-        raise ModelError(f"{label}: a mass, inertia, position or coefficient is {_LARGEST:g} or more; correct it")
+    largest = 1e50  # products of several of them do not overflow
+    if not all(np.all(np.abs(x) < largest) for x in (*of_bodies, *of_joints)):
+        raise ModelError(f"{label}: a mass, inertia, position or coefficient is {largest:g} or more; correct it")
     kinds = mujoco_module().mjtJoint
     for k in range(model.njnt):
         name = model.joint(k).name
@@ -378,10 +376,8 @@ def _body(model: Any, i: int) -> Body:
     centre, mass = np.array(model.body_ipos[i]), float(model.body_mass[i])
     axes = _rotation(model.body_iquat[i])
     about_centre = axes @ np.diag(0.5 * model.body_inertia[i].sum() - model.body_inertia[i]) @ axes.T
-    inertial = np.zeros((4, 4))
-    inertial[:3, :3] = about_centre + mass * np.outer(centre, centre)
-    inertial[:3, 3] = inertial[3, :3] = mass * centre
-    inertial[3, 3] = mass
+    second, first_moments = about_centre + mass * np.outer(centre, centre), (mass * centre)[:, None]
+    inertial = np.block([[second, first_moments], [first_moments.T, np.array([[mass]])]])
     first = int(model.body_jntadr[i])
     return Body(
         name=model.body(i).name or f"body{i}",

@@ -33,14 +33,13 @@ class _Motion(NamedTuple):
     coordinate: str | None
 
 
-_FORCE = ("N m", "N")
 _UNITS = {
     "armature": ("kg m^2", "kg"),
     "damping": ("N m s/rad", "N s/m"),
-    "friction": _FORCE,
-    "stribeck": _FORCE,
+    "friction": ("N m", "N"),
+    "stribeck": ("N m", "N"),
     "spring": ("N m/rad", "N/m"),
-    "offset": _FORCE,
+    "offset": ("N m", "N"),
 }
 """Units of the parameters to which forces of a joint are proportional, of hinges and of slides."""
 
@@ -50,8 +49,6 @@ UNKNOWN = (*_UNITS, _GAIN, _BIAS)
 
 _BASE = {"base_w{}": "rad/s", "base_w{}_dot": "rad/s^2", "base_f{}": "m/s^2"}
 """Inputs of a measured base."""
-
-_INERTIAL_UNITS = dict(zip(INERTIAL_NAMES, ("kg", *("kg m",) * 3, *("kg m^2",) * 6), strict=True))
 
 
 @dataclass(frozen=True)
@@ -129,11 +126,9 @@ class Mechanism:
             # first.
             for kind in (*INERTIAL_NAMES[1:], INERTIAL_NAMES[0]):
                 positive = kind in ("mass", "Ixx", "Iyy", "Izz") and values[kind] > 0.0
+                unit = "kg" if kind == "mass" else "kg m" if kind.startswith("h") else "kg m^2"
                 found[f"{kind}_{identifier(body.name)}"] = Parameter(
-                    _INERTIAL_UNITS[kind],
-                    positive=positive,
-                    value=values[kind],
-                    combination=((f"{kind} {body.name}", 1.0),),
+                    unit, positive=positive, value=values[kind], combination=((f"{kind} {body.name}", 1.0),)
                 )
         return found
 
@@ -195,9 +190,8 @@ class Mechanism:
         """Force that a motion takes, by coordinate, with values of the `nominal` parameters, and of a measured base."""
         motions = self._motions(q, v, a)
         inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
-        of_joints = inverse_dynamics(
-            self.description, [x.q for x in motions], [x.v for x in motions], [x.a for x in motions], inertials, base
-        )
+        q, v, a = ([x[k] for x in motions] for k in range(3))
+        of_joints = inverse_dynamics(self.description, q, v, a, inertials, base)
         forces: dict[str, Any] = dict.fromkeys(self.coordinates, ca.SX(0))
         for joint, x, force in zip(self.description.joints, motions, of_joints, strict=True):
             if x.coordinate is not None:

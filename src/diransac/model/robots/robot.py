@@ -142,8 +142,7 @@ def robot_limits(
     ModelError
         The file cannot be read, or a name is unknown.
     """
-    description = read_description(path, base)
-    chosen = _coordinates(f'robot "{path}"', description, joints)
+    _, description, chosen = _read(path, base, joints)
     found: dict[str, tuple[float, float]] = {}
     for name, joint in ((n, description.joints[k]) for n, k in chosen.items()):
         own = np.inf if actuation is None else actuation.largest_force(name)
@@ -186,9 +185,7 @@ def body_position(
     ModelError
         The file cannot be read, a name is unknown, or the point is no point.
     """
-    description = read_description(path, base)
-    label = f'robot "{path}"'
-    chosen = _coordinates(label, description, joints)
+    label, description, chosen = _read(path, base, joints)
     names = [x.name for x in description.bodies]
     i = names.index(_known_names("body", body, names)[0])
     couplings, needed = ordered_couplings(label, description), _moving(label, description, chosen)[i]
@@ -231,10 +228,17 @@ def coordinates_of_bodies(
     ModelError
         The file cannot be read, or a name is unknown.
     """
-    description = read_description(path, base)
-    label = f'robot "{path}"'
-    moving = _moving(label, description, _coordinates(label, description, joints))
+    label, description, chosen = _read(path, base, joints)
+    moving = _moving(label, description, chosen)
     return {body.name: names for body, names in zip(description.bodies, moving, strict=True)}
+
+
+def _read(
+    path: str | Path, base: str | None, joints: Collection[str] | Mapping[str, str] | str | None
+) -> tuple[str, Description, dict[str, int]]:
+    """Label of a robot in messages, its description, and the index of the joint of each coordinate."""
+    label, description = f'robot "{path}"', read_description(path, base)
+    return label, description, _coordinates(label, description, joints)
 
 
 def _moving(label: str, description: Description, chosen: Mapping[str, int]) -> list[tuple[str, ...]]:

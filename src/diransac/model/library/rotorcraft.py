@@ -1,6 +1,4 @@
-"""Planar rotorcraft with unmodelled effects of its rotors: the extended plant, Dimmig et al. 2023, section IV."""
-
-from __future__ import annotations
+"""Planar rotorcraft, and the same with unmodelled effects of its rotors: Dimmig et al. 2023, section IV."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +10,59 @@ import casadi as ca
 
 from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
-from diransac.model.library.planar_rotorcraft import planar_rotorcraft
 from diransac.model.model import Model
+from diransac.model.parameter import Parameter
 from diransac.model.plant import Disturbance, Plant, check_possible
 
-__all__ = ["BLADE_FLAPPING", "TABLE_I", "extended_rotorcraft"]
+__all__ = ["BLADE_FLAPPING", "TABLE_I", "extended_rotorcraft", "planar_rotorcraft"]
+
+
+def planar_rotorcraft(arm_length: float = 0.177, gravity: float = 9.81) -> Model:
+    """Model of two rotors in the vertical plane, with induced drag.
+
+    ``m x'' = -T sin(theta) - C |T| x' cos(theta)``
+    ``m (z'' + g) = T cos(theta) - C |T| z' sin(theta)``
+    ``I theta'' = L M``
+
+    Parameters
+    ----------
+    arm_length : float
+        L, distance of each rotor from the centre of gravity, m (Table I).
+    gravity : float
+        g, m/s^2.
+
+    Returns
+    -------
+    Model
+        Coordinates x, z (world frame, m) and theta (rad). Inputs thrust T (N, along the body's z axis) and moment M
+        (the paper's u_2, multiplied by L in eq. (4): N). Parameters mass m, inertia I, drag C (induced drag, s/m).
+
+    References
+    ----------
+    Dimmig et al. 2023, eqs. (4) and (5), Table I.
+    """
+
+    def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
+        drag = p.drag * ca.fabs(u.thrust)
+        return [
+            p.mass * a.x + u.thrust * ca.sin(q.theta) + drag * v.x * ca.cos(q.theta),
+            p.mass * (a.z + gravity) - u.thrust * ca.cos(q.theta) + drag * v.z * ca.sin(q.theta),
+            p.inertia * a.theta - arm_length * u.moment,
+        ]
+
+    return Model(
+        name="planar-rotorcraft",
+        description="two rotors in the vertical plane with induced drag (Dimmig et al. 2023, eq. (4))",
+        coordinates={"x": "m", "z": "m", "theta": "rad"},
+        inputs={"thrust": "N", "moment": "N"},
+        parameters={
+            "mass": Parameter("kg", positive=True),
+            "inertia": Parameter("kg m^2", positive=True),
+            "drag": Parameter("s/m", lower=0.0),
+        },
+        equations=equations,
+    )
+
 
 TABLE_I: Mapping[str, float] = MappingProxyType({"mass": 0.249, "inertia": 0.004, "drag": 0.025})
 """Mass (kg), inertia (kg m^2) and induced drag (s/m) of the paper's rotorcraft, Table I."""
@@ -27,21 +73,6 @@ BLADE_FLAPPING = 0.3
 With ideal twist and C_T of Table I: inflow ``lambda = sqrt(2 C_T / pi) / pi = 0.062``; tip pitch
 ``theta_t = lambda + 16 C_T / (pi^3 sigma a) = 0.107`` with solidity sigma = 0.12 and lift slope a = 5.7.
 """
-
-_LARGEST_MU = 0.5
-"""Advance ratio above which flapping is constant: the rotor almost stands still."""
-
-_POSITIVE = 1e-6, 1e6
-_RANGES = {
-    "thrust_coefficient": _POSITIVE,
-    "power_coefficient": (0.0, 1e6),
-    "diameter": _POSITIVE,
-    "arm_length": _POSITIVE,
-    "rotor_height": (-1e6, 1e6),
-    "air_density": _POSITIVE,
-    "gravity": (0.0, 1e6),
-}
-"""Values in SI units that a machine can have, by far."""
 
 _EFFECTS = ("rotational", "gravitational")
 PerRotor = float | tuple[float, float]
@@ -127,21 +158,8 @@ def extended_rotorcraft(
     for effect in mass_effects:
         _check_choice("mass_effects", effect, _EFFECTS)
     numbers = (thrust_coefficient, power_coefficient, diameter, arm_length, rotor_height, air_density, gravity)
-    for (name, (low, high)), value in zip(_RANGES.items(), numbers, strict=True):
-        if isinstance(value, Sequence) or not low <= value <= high:
-            raise ModelError(f"extended rotorcraft: {name} is {value}; give one number from {low:g} to {high:g}")
+    rotors = _Rotors(convention, phase, *numbers)
     model = planar_rotorcraft(arm_length, gravity)
-    rotors = _Rotors(
-        convention,
-        phase,
-        thrust_coefficient,
-        power_coefficient,
-        diameter,
-        arm_length,
-        rotor_height,
-        air_density,
-        gravity,
-    )
     mass = {effect: mass_imbalance if effect in mass_effects else 0.0 for effect in _EFFECTS}
     constants = _per_rotor(aerodynamic=aerodynamic_imbalance, **mass)
     known = Plant(model, parameters)
@@ -165,6 +183,13 @@ class _Rotors:
     rotor_height: float
     air_density: float
     gravity: float
+
+    def __post_init__(self) -> None:
+        smallest = {"power_coefficient": 0.0, "rotor_height": -1e6, "gravity": 0.0}
+        for name, value in list(vars(self).items())[2:]:
+            low, high = smallest.get(name, 1e-6), 1e6  # SI units: more than any machine has
+            if isinstance(value, Sequence) or not low <= value <= high:
+                raise ModelError(f"extended rotorcraft: {name} is {value}; give one number from {low:g} to {high:g}")
 
     @property
     def thrust_factor(self) -> float:
@@ -224,7 +249,8 @@ class _Rotors:
             back, up, torque = ca.SX(0), ca.SX(0), ca.SX(0)
             for i, n in enumerate(self.speeds(u), start=1):
                 thrust, tip_speed = self.thrust_factor * n**2, pi * self.diameter * n
-                mu = ca.fmax(ca.fmin(along / ca.fmax(tip_speed, 1e-9), _LARGEST_MU), -_LARGEST_MU)
+                # Flapping is constant above an advance ratio of 0.5, where the rotor almost stands still.
+                mu = ca.fmax(ca.fmin(along / ca.fmax(tip_speed, 1e-9), 0.5), -0.5)
                 tilt = d[f"flapping_{i}"] * mu / (1 - mu**2 / 2)
                 lost, arm = thrust * (ca.cos(tilt) - 1), self.arm_length * (1 if i == 2 else -1)
                 back += thrust * ca.sin(tilt)
