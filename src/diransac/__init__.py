@@ -55,8 +55,9 @@ if TYPE_CHECKING:
     from diransac.identification.assessment.open_loop import simulate
     from diransac.identification.assessment.validation import Validation, validate
     from diransac.identification.finding import Finding
-    from diransac.identification.identify import METHODS, identify
+    from diransac.identification.identify import identify
     from diransac.identification.method import Progress
+    from diransac.identification.methods import METHODS
     from diransac.identification.methods.least_squares import LeastSquares
     from diransac.identification.methods.lo_diransac import LoDiransac
     from diransac.identification.methods.ransac import Diransac, IDiransac
@@ -186,8 +187,9 @@ _FOUND_IN = {
     "identification.finding": ("Finding",),
     "identification.regression.estimators": ("OrdinaryLeastSquares", "TotalLeastSquares"),
     "identification.regression.scikit_learn": ("ScikitLearnEstimator",),
-    "identification.identify": ("METHODS", "identify"),
+    "identification.identify": ("identify",),
     "identification.method": ("Progress",),
+    "identification.methods": ("METHODS",),
     "identification.methods.least_squares": ("LeastSquares",),
     "identification.methods.lo_diransac": ("LoDiransac",),
     "identification.methods.ransac": ("Diransac", "IDiransac"),

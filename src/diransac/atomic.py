@@ -20,9 +20,6 @@ if sys.platform != "win32":
     import fcntl
 
 
-__all__ = ["draft", "write_bytes", "write_text", "write_with"]
-
-
 @contextmanager
 def draft(target: Path) -> Iterator[Path]:
     """Context with a file's place in a private folder beside it, of the same name; the folder is then removed.

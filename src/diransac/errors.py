@@ -15,18 +15,6 @@
 Messages state the problem, the value found, and the remedy.
 """
 
-__all__ = [
-    "DiransacError",
-    "IdentificationError",
-    "LogError",
-    "ModelError",
-    "PlanningError",
-    "ResultError",
-    "SettingsError",
-    "StudyError",
-    "TimeLimitError",
-]
-
 
 class DiransacError(Exception):
     """Base class of the exceptions of diransac."""

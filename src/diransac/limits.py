@@ -6,28 +6,6 @@ import os
 import stat
 from pathlib import Path
 
-__all__ = [
-    "DEEPEST",
-    "LARGEST_LOG",
-    "LARGEST_RESULT",
-    "LARGEST_TABLE",
-    "LARGEST_TEXT",
-    "MOST_CELLS",
-    "MOST_COLUMNS",
-    "MOST_COMPILED",
-    "MOST_COUNTED",
-    "MOST_ELEMENTS",
-    "MOST_JOINTS",
-    "MOST_NAMES",
-    "MOST_NUMBERS",
-    "MOST_OPERATIONS",
-    "MOST_ROWS",
-    "MOST_SOLVED",
-    "beyond",
-    "check_ordinary",
-    "read_bytes",
-]
-
 LARGEST_LOG = 2**30
 """Bytes of the file of a table, and of what it unpacks to."""
 

@@ -12,8 +12,6 @@ from typing import Any, NoReturn
 from diransac.errors import SettingsError
 from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
 
-__all__ = ["json_data", "read_text", "toml_file", "toml_table"]
-
 
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
     """Text of a file.

@@ -16,8 +16,6 @@ import keyword
 import re
 from collections.abc import Callable
 
-__all__ = ["cell", "comment", "identifier", "is_one_line", "literal", "one_line", "printable"]
-
 _LONGEST_COMMENT = 2000
 _LONGEST_CELL = 32_766
 """Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""

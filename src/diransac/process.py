@@ -14,8 +14,6 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["memory_kept", "module_path_safe", "single_threaded"]
-
 
 class _Setting:
     """Context in which a setting of the process holds; the last context to end undoes it, whichever began.

@@ -7,10 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from diransac.plain_text import one_line
 
-__all__ = [
-    "aligned", "duration", "listed", "number", "percent", "plural", "share", "some", "superscript", "telling_digits",
-]  # fmt: skip
-
 _LEAST_PERCENT = 0.01
 
 

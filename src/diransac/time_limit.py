@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 from diransac.errors import SettingsError, TimeLimitError
 
-__all__ = ["check_time", "end_search", "time_left", "time_limited", "time_unlimited"]
-
 
 class _Deadline(NamedTuple):
     """Moment at which time is over, s of the monotonic clock, and the limit that sets it, s."""

@@ -20,8 +20,6 @@ from pathlib import Path
 
 from diransac.errors import DiransacError, ModelError
 
-__all__ = ["CONFIRMED", "blaming", "definitions", "file_and_name", "in_words", "leave_stdout", "running", "silenced"]
-
 CONFIRMED = "DIRANSAC_CODE_SHA256"
 """Environment variable with the SHA-256 of the only code that may be run, empty for none; any code where it is not set.
 

@@ -17,23 +17,6 @@ from diransac.model import Model
 from diransac.plain_data import toml_file, toml_table
 from diransac.user_files import definitions, file_and_name
 
-__all__ = [
-    "fixed_parameters",
-    "is_description",
-    "load_methods",
-    "load_model",
-    "load_settings",
-    "model_file",
-    "names",
-    "numbers",
-    "pairs",
-    "preparation_of",
-    "prior_pairs",
-    "start_values",
-    "toml_value",
-]
-
-
 # ---------------------------------------------------------------------- lists of pairs
 
 

@@ -18,8 +18,6 @@ from diransac.identification.result import Result
 from diransac.model import Model
 from diransac.text_table import aligned
 
-__all__ = ["Comparison", "compare_methods"]
-
 
 @dataclass(frozen=True)
 class Comparison:

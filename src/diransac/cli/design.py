@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from diransac.flight.planning import Experiment
     from diransac.flight.trajectory import Trajectory
 
-__all__ = ["DesignOptions", "DesignedModel", "Designs", "designed", "source_of"]
-
-
 DesignedModel = Annotated[
     str,
     typer.Argument(

@@ -19,17 +19,6 @@ from diransac.model import Model
 from diransac.model.library import TABLE_I, extended_rotorcraft, planar_rotorcraft
 from diransac.model.plant import Plant, check_possible
 
-__all__ = [
-    "FlightPicture",
-    "FlightSeed",
-    "LogOutput",
-    "NoiseOptions",
-    "OptionalLogOutput",
-    "PlantOptions",
-    "TrajectoryArgument",
-    "TrajectoryOption",
-]
-
 T = TypeVar("T")
 
 Shape: TypeAlias = Literal["star", "square", "sine"]

@@ -23,8 +23,6 @@ from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, Plant
 from diransac.text_table import aligned
 
-__all__ = ["FlightTest", "SimulatedFlight", "TrackedFlight", "fly_identified", "simulate_flight"]
-
 
 @dataclass(frozen=True)
 class TrackedFlight:

@@ -18,8 +18,6 @@ from typer.core import TyperGroup
 from diransac.cli import INTERRUPTED, screen
 from diransac.errors import DiransacError
 
-__all__ = ["Group", "grouped"]
-
 UsageError: type[Any] = typer.BadParameter.__mro__[1]
 
 

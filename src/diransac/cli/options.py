@@ -34,28 +34,6 @@ from diransac.simulation import HOLDS
 if TYPE_CHECKING:
     from diransac.data.readers.growing import Growing
 
-__all__ = [
-    "Derivation",
-    "FixedParameters",
-    "JsonFlag",
-    "LogFile",
-    "LogFiles",
-    "MethodName",
-    "ModelName",
-    "OptionalModelName",
-    "Output",
-    "Preparation",
-    "Report",
-    "ResultFile",
-    "Search",
-    "Seed",
-    "StrictFlag",
-    "TimeLimit",
-    "known_methods",
-    "output_file",
-    "output_or_stdout",
-]
-
 
 def _known(what: str, choices: Collection[str]) -> Callable[[Any], Any]:
     """Callback that accepts None and one of some names."""

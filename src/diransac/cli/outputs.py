@@ -13,8 +13,6 @@ from diransac.cli.screen import copy, stdout_taken
 from diransac.data.files import put_in_place
 from diransac.errors import DiransacError, ResultError
 
-__all__ = ["PAGE", "RESULT", "STDOUT", "check_ending", "checked", "staged"]
-
 STDOUT = Path("-")
 """Name of stdout among outputs, and of stdin among logs."""
 RESULT = (".json",)

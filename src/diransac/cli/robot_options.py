@@ -19,8 +19,6 @@ from diransac.text_table import aligned, telling_digits
 if TYPE_CHECKING:
     from diransac.model.robots import Actuation, MotorCurrents, PositionControl
 
-__all__ = ["LimbResults", "RobotOptions", "UnsaturatedRobot", "of_limb"]
-
 Drives = TypeVar("Drives", "PositionControl", "MotorCurrents")
 
 _NUMBERS = {"kp", "kd", "limit", "constant", "gear"}

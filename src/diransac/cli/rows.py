@@ -20,8 +20,6 @@ from diransac.identification.method import Method
 from diransac.model import Model
 from diransac.plain_text import one_line, printable
 
-__all__ = ["Cluster", "FleetOptions", "Jobs", "running"]
-
 Progress = Callable[[int, int], None]
 
 Jobs = Annotated[int | None, typer.Option(min=1, metavar="N", help="Number of processes; one per core by default.")]

@@ -19,27 +19,6 @@ from diransac.identification.method import Callback, Progress
 from diransac.plain_text import one_line, printable
 from diransac.time_limit import end_search
 
-__all__ = [
-    "Lines",
-    "bar",
-    "command",
-    "copy",
-    "emit",
-    "end",
-    "is_quiet",
-    "is_terminal",
-    "live",
-    "note",
-    "progress_bar",
-    "say",
-    "set_command",
-    "set_for_programs",
-    "set_verbosity",
-    "show",
-    "shows_bars",
-    "stdout_taken",
-]
-
 _STATE = {"verbosity": 0, "taken": 0, "for_programs": 0}
 """Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout; 1 where
 progress is for programs.

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from diransac.identification.tracking import TrackedEstimate, Tracker
     from diransac.model import Model
 
-__all__ = ["Summary", "TrackTable", "as_line", "followed", "to_dict", "tracked"]
-
 Columns = dict[str, FloatArray]
 
 

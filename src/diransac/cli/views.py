@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from diransac.data.readers.topics import TopicTable
     from diransac.data.suggested_mapping import Coverage
 
-__all__ = ["CacheState", "Equations", "ModelList", "Recorded"]
-
 
 @dataclass(frozen=True)
 class ModelList:

@@ -18,24 +18,6 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = [
-    "alike",
-    "as_column",
-    "as_doubles",
-    "as_numbers",
-    "check_clock",
-    "check_even",
-    "check_names",
-    "check_time_order",
-    "describe_gaps",
-    "describe_jitter",
-    "is_implausible",
-    "numeric_columns",
-    "other_spelling",
-    "rows_per_sample",
-]
-
-
 _ROUNDING = 1e-6
 _SHORTEST_ABBREVIATION, _LONGEST_NAME = 3, 100
 """Letters of a name that are compared."""

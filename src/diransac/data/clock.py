@@ -18,8 +18,6 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import checks
 from diransac.errors import LogError
 
-__all__ = ["Gridded", "in_order", "is_even", "on_own_grid", "runs_freely"]
-
 
 @dataclass(frozen=True)
 class Gridded:

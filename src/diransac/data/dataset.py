@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["Dataset", "ParameterLayout", "as_logs", "distinct_logs", "usable_sensors"]
-
 
 class ParameterLayout:
     """Positions of every log's parameters in one vector: shared ones once, per-log ones once per log.

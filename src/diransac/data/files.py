@@ -32,19 +32,6 @@ from diransac.atomic import draft
 from diransac.data.filters import FilterSpecification
 from diransac.errors import LogError, SettingsError
 
-__all__ = [
-    "COMMENT",
-    "ENDINGS",
-    "KEY",
-    "MEMBER",
-    "Metadata",
-    "decode_metadata",
-    "place_of_metadata",
-    "put_in_place",
-    "write_columns",
-]
-
-
 KEY, MEMBER, COMMENT = "diransac", "diransac.json", "# diransac:"
 """Place of the metadata in a Parquet file, in an NPZ archive and, of earlier versions, in CSV text."""
 _VERSION, _UNIT = 1, "schema:unitText"

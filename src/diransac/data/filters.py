@@ -18,9 +18,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 
-__all__ = ["REACH", "FilterSpecification", "convolve", "half_length", "kernels", "median_filter"]
-
-
 REACH = 2.5
 _ROWS_AT_A_TIME = 20_000
 """Rows whose windows are copied together."""

@@ -8,8 +8,6 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 
-__all__ = ["InputTiming", "acting_inputs"]
-
 
 @dataclass(frozen=True)
 class InputTiming:

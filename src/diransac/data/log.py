@@ -22,8 +22,6 @@ from diransac.data.filters import FilterSpecification
 from diransac.data.units import split_unit
 from diransac.errors import LogError
 
-__all__ = ["Log"]
-
 
 class Frame(Protocol):
     """Common interface of polars and pandas data frames."""

@@ -14,8 +14,6 @@ from diransac.arrays import FloatArray
 from diransac.errors import LogError
 from diransac.text_table import some
 
-__all__ = ["ATTITUDES", "AXES", "Condition", "Event", "LogMapping", "MappedSignals", "held"]
-
 TextArray = np.ndarray[Any, np.dtype[np.object_]]
 
 

@@ -41,8 +41,6 @@ from diransac.errors import LogError
 from diransac.limits import LARGEST_TABLE
 from diransac.plain_data import read_text, toml_table
 
-__all__ = ["BUILT_IN", "load_mapping", "parse_mapping"]
-
 BUILT_IN = ("px4-multirotor", "crazyflie", "ros-joint-states", "ros-odometry-imu", "lerobot")
 """Names of the mappings that come with the package."""
 

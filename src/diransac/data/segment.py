@@ -19,9 +19,6 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = ["Segment", "bind_log", "spelling_notes"]
-
-
 _LONG_HOLD = 3
 """Rows that an input is held for, beyond which the motion is no longer the one that it made."""
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from diransac.model import Model
 
-__all__ = ["Coverage", "suggest_mapping"]
-
 _STATES = frozenset(
     {"mode", "state", "status", "armed", "airborne", "landed", "flying", "enabled", "contact", "battery"}
 )

@@ -12,9 +12,6 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["conversion", "one_turn", "same_unit", "split_unit"]
-
-
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _TOKEN = re.compile(r"\s*([*/^()]|[+-]?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?|[^\W\d_]+|[°%])")
 _HEADER = re.compile(r"^(?P<name>.*\S)\s*\[\s*(?P<unit>[^\[\]]*[^\W\d_°%][^\[\]]*|°|%)\s*\]$")

@@ -16,8 +16,6 @@ from diransac.export.portable import PortableModel
 from diransac.export.statements import PYTHON, C, statements
 from diransac.plain_text import comment, literal
 
-__all__ = ["FORMATS", "format_of", "write_model"]
-
 FORMATS = {
     "c": (".c",),
     "python": (".py",),

@@ -15,8 +15,6 @@ from diransac.model import Model
 from diransac.plain_text import identifier
 from diransac.text_table import duration
 
-__all__ = ["PortableModel"]
-
 _HOLDS = {
     "zero-order": "the inputs were held between samples",
     "linear": "the inputs were interpolated linearly between samples: give a step the mean of those at its ends",

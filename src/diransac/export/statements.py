@@ -16,8 +16,6 @@ import numpy as np
 from diransac.errors import ModelError
 from diransac.simulation.compiler.graph import Graph, Instruction, read_graph
 
-__all__ = ["PYTHON", "C", "Dialect", "statements"]
-
 
 @dataclass(frozen=True)
 class Dialect:

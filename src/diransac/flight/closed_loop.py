@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller
 
-__all__ = ["fly", "fly_batch", "tracking_error"]
-
-
 _SAME_INSTANT = 1e-6
 
 

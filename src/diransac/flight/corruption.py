@@ -20,8 +20,6 @@ from diransac.data.preprocessing import shift
 from diransac.errors import LogError, SettingsError
 from diransac.flight.noise import Draws, Noise, gaussian_errors, leverage_rows, quantised, with_faults
 
-__all__ = ["CorruptedLog", "corrupt"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CorruptedLog(Log):

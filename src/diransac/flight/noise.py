@@ -24,8 +24,6 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.data.log import Log
 
-__all__ = ["Draws", "Noise", "gaussian_errors", "leverage_rows", "quantised", "with_faults"]
-
 _CHOICES = {
     "outliers": ("signals", "rows"),
     "integrated": ("white", "random-walk"),

@@ -16,8 +16,6 @@ from diransac.model import Model
 from diransac.simulation import linearized_step
 from diransac.simulation.compiler import Map, Scan, compile_map, compile_scan
 
-__all__ = ["Problem", "gains_of"]
-
 
 @dataclass(frozen=True)
 class Problem:

@@ -12,8 +12,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 
-__all__ = ["Trajectory"]
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:

@@ -18,8 +18,6 @@ from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.simulation import LinearFeedback
 
-__all__ = ["Controller", "check_weights", "tvlqr", "tvlqr_batch"]
-
 Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 """Matrix, diagonal, one number for the whole diagonal, or diagonal by name."""
 

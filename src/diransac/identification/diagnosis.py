@@ -23,8 +23,6 @@ from diransac.data.segment import runs
 from diransac.identification.regression.uncertainty import robust_std
 from diransac.identification.serialization import Masks, Number, Numbers, Series, Values, WholeNumbers
 
-__all__ = ["Departure", "Diagnosis", "Resolution", "departures"]
-
 
 @dataclass(frozen=True)
 class Resolution:

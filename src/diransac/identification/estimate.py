@@ -13,18 +13,6 @@ from diransac.identification.finding import Finding
 from diransac.identification.serialization import Mask, Number, Numbers, Values
 from diransac.identification.structure.lacking_terms import PossibleTerm, Suggestion
 
-__all__ = [
-    "TIME_LIMIT",
-    "Competition",
-    "Competitor",
-    "Estimate",
-    "Evaluation",
-    "LogEstimate",
-    "LogSummary",
-    "Prediction",
-]
-
-
 TIME_LIMIT = "time limit reached"
 """Stop reason of a search that a limit on its time ended."""
 

@@ -7,21 +7,6 @@ from typing import Any, Literal, get_args
 
 from diransac.identification.serialization import Form
 
-__all__ = [
-    "FAR",
-    "VALIDATE",
-    "Finding",
-    "Level",
-    "Verdict",
-    "by_seriousness",
-    "graded",
-    "next_line",
-    "shown",
-    "shown_lines",
-    "verdict_of",
-]
-
-
 Level = Literal["note", "good", "care", "bad"]
 """Levels of findings, the least serious first."""
 

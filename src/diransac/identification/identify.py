@@ -31,8 +31,6 @@ from diransac.process import single_threaded
 from diransac.simulation import HOLDS
 from diransac.time_limit import check_time, time_limited
 
-__all__ = ["METHODS", "Identification", "checked_hold", "identify", "method_object"]
-
 
 def identify(
     model: Model,

@@ -21,8 +21,6 @@ from diransac.model import Model
 if TYPE_CHECKING:
     from diransac.identification.estimate import Estimate
 
-__all__ = ["Callback", "Method", "Progress", "extremes", "fit", "numerical_failures", "report", "within"]
-
 
 @dataclass(frozen=True)
 class Progress:

@@ -34,8 +34,6 @@ from diransac.model import Model
 from diransac.model.parameter import parameter_of
 from diransac.plain_data import json_data, read_text
 
-__all__ = ["Result"]
-
 
 @dataclass(frozen=True, eq=False)
 class Result:

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from diransac.export import PortableModel
     from diransac.identification.result import Result
 
-__all__ = ["as_dict", "export", "from_data", "write"]
-
 _FORMAT = 10
 _SINCE: Mapping[int, Mapping[str, object]] = {9: {"mistakes": (), "n_columns_tested": 0}}
 """Formats that are read besides, with the values of what they lack."""

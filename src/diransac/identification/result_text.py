@@ -13,8 +13,6 @@ from diransac.text_table import aligned, telling_digits
 if TYPE_CHECKING:
     from diransac.identification.result import Result
 
-__all__ = ["html_of", "text_of"]
-
 
 def text_of(result: Result) -> str:
     """Tables, verdict, findings and notes."""

@@ -16,20 +16,6 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = [
-    "Form",
-    "Mask",
-    "Masks",
-    "Number",
-    "NumberPairs",
-    "Numbers",
-    "Series",
-    "Values",
-    "WholeNumbers",
-    "dump",
-    "load",
-]
-
 T = TypeVar("T")
 
 

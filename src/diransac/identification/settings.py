@@ -12,18 +12,6 @@ import numpy as np
 from diransac.errors import SettingsError
 from diransac.simulation import INTEGRATORS
 
-__all__ = [
-    "EXECUTION",
-    "JUDGING",
-    "MOST_SUBSTEPS",
-    "SIMULATION",
-    "Settings",
-    "check_substeps",
-    "check_used",
-    "finite_number",
-    "nearest_names",
-]
-
 MOST_SUBSTEPS = 10_000
 """Integration steps per sample, at most: more are a slip of the pen, and take hours."""
 

@@ -24,9 +24,6 @@ from diransac.user_files import in_words
 if TYPE_CHECKING:
     from diransac.model.parameter import Parameter
 
-__all__ = ["Probe", "Symbols"]
-
-
 _N_POINTS = 40
 _TOLERANCE = 1e-8
 _ARGUMENTS = "qvaup"

@@ -25,8 +25,6 @@ import casadi as ca
 from diransac.errors import ModelError, ResultError
 from diransac.limits import MOST_OPERATIONS, beyond
 
-__all__ = ["Step", "check_size", "has_nan", "printed", "restored", "steps", "stored"]
-
 _VERSION = 1
 
 

@@ -31,8 +31,6 @@ from diransac.model.parameter import Parameter
 from diransac.model.sensors import Sensor, with_parameters_of
 from diransac.model.signals import Signals
 
-__all__ = ["Model"]
-
 Equations = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Sequence[Any]]
 Kinematics = Callable[[Symbols, Symbols], Sequence[Any]]
 

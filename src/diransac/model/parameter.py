@@ -12,8 +12,6 @@ import numpy.typing as npt
 from diransac.errors import ModelError
 from diransac.plain_text import is_one_line
 
-__all__ = ["Parameter", "parameter_of"]
-
 
 def parameter_of(name: str, parameters: Collection[str]) -> str:
     """Parameter of a model that a value is of: ``bias`` of ``bias[0]``, its value in the first of several logs.

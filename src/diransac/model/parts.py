@@ -13,8 +13,6 @@ from diransac.arrays import BoolArray
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
-__all__ = ["independent_parts"]
-
 
 def independent_parts(model: Model) -> dict[str, Model]:
     """Models of the parts of a machine that do not act on each other, which can be identified one by one.

@@ -22,8 +22,6 @@ from diransac.model import derivation, expressions
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 
-__all__ = ["Disturbance", "DisturbedModel", "ModelWithParameters", "Plant", "as_plant", "check_possible"]
-
 Effect = Callable[[Symbols, Symbols, Symbols, Symbols, Symbols], Mapping[str, Any]]
 """``effect(q, v, u, p, d)`` gives expressions by name."""
 

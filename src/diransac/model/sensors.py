@@ -32,8 +32,6 @@ from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
 from diransac.plain_text import is_one_line
 
-__all__ = ["Sensor", "accelerometer", "encoder", "gyroscope", "magnetometer", "range_to"]
-
 Attitude: TypeAlias = str | Sequence[str] | Callable[[Any, Any], Any]
 Vector: TypeAlias = Sequence[float]
 

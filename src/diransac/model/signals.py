@@ -14,8 +14,6 @@ from diransac.model import derivation
 from diransac.model.derivation import Symbols
 from diransac.model.parameter import Parameter
 
-__all__ = ["Signals"]
-
 
 class Signals:
     """Coordinates, velocities, accelerations, inputs, parameters and sensors of a model by name, with their units.

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["LEAST", "LogAxis", "MarkRow", "evaluates_parameters", "methods_and_errors", "plot_estimates"]
-
-
 LEAST = -3
 """Power of ten, %, below which errors are not resolved."""
 

@@ -19,36 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "COLOURS",
-    "DASHES",
-    "INK",
-    "LINE",
-    "MUTED",
-    "PAPER",
-    "REFERENCE",
-    "RULE",
-    "SOFT",
-    "WIDTH",
-    "LegendEntry",
-    "Range",
-    "axes_at",
-    "check_ending",
-    "draw_heading",
-    "empty_figure",
-    "extent",
-    "flight_panels",
-    "headed_figure",
-    "inches",
-    "name_panel",
-    "panel",
-    "round_step",
-    "svg",
-    "write",
-    "write_at",
-    "write_caption",
-]
-
 Range = tuple[float, float]
 """Smallest and largest value that an axis shows."""
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_fleet"]
-
 
 def plot_fleet(summary: FleetSummary, path: str | Path | None = None, *, title: str | None = None) -> Figure:
     """Figure with a row per parameter: estimates over the logs of each vehicle, and values by vehicle.

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_flight", "plot_prediction"]
-
 
 def plot_flight(
     trajectory: Trajectory | Mapping[str, Trajectory],

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["levels_with_paths", "plot_paths"]
-
 Path2 = npt.NDArray[np.float32]
 _Paths = Mapping[str, Mapping[str, list[Path2]]]
 

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["axis_label", "level_labels", "method_looks", "n_trials", "plot_study", "title_of"]
-
-
 # Inches: height of a row of panels, of a trajectory's name, of the axis below the panels, of a row of failures.
 _ROW, _NAME, _AXIS, _CELL = 1.5, 0.24, 0.36, 0.19
 _COLUMNS = 3

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["INTERVAL", "plot_tracking", "usual_range"]
-
 INTERVAL = 1.96
 """Half the width of a 95 % interval, in standard errors."""
 _CHANGE: dict[str, Any] = {"color": COLOURS[2], "linewidth": 1.0, "linestyle": (0.0, DASHES[2])}

@@ -17,22 +17,6 @@ import numpy.typing as npt
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.segment import runs
 
-__all__ = [
-    "Figure",
-    "Panel",
-    "Plot",
-    "Scale",
-    "Tick",
-    "Timeline",
-    "Trace",
-    "extremes",
-    "padded",
-    "path_data",
-    "ticks",
-    "time_axis",
-    "time_plot",
-]
-
 Tick = tuple[str, str]
 """Position in percent of an axis, and text."""
 

@@ -15,8 +15,6 @@ from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padde
 from diransac.report.runs import Entry
 from diransac.text_table import number, percent
 
-__all__ = ["friction_figures"]
-
 # Part of the samples at either end of the speeds, and of the forces, that may be outside of the figure.
 _TAIL = 0.005
 

@@ -15,8 +15,6 @@ from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padde
 from diransac.report.runs import Run
 from diransac.text_table import number, percent, plural, share
 
-__all__ = ["LogFigures", "figures_of"]
-
 _VISIBLE = 0.01
 _STRETCHES = 6
 

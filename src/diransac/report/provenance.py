@@ -15,8 +15,6 @@ from diransac.report.rendering import numbered
 from diransac.report.runs import Entry
 from diransac.text_table import number, percent, plural
 
-__all__ = ["log_facts", "model_text", "notes", "preparation", "settings", "unique_models", "versions"]
-
 
 def unique_models(entries: Sequence[Entry]) -> list[Model]:
     """The models of the page."""

@@ -17,18 +17,6 @@ from diransac.text_table import number, percent, plural
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = [
-    "Block",
-    "Section",
-    "Table",
-    "embedded",
-    "encodable",
-    "environment",
-    "numbered",
-    "script_policy",
-    "write_page",
-]
-
 
 @dataclass(frozen=True)
 class Table:

@@ -33,16 +33,6 @@ from diransac.identification.result import Result
 from diransac.report.rendering import numbered
 from diransac.simulation import inlier_mask
 
-__all__ = [
-    "Entry",
-    "LogView",
-    "Run",
-    "log_view",
-    "simulate_all",
-    "simulate_on",
-]
-
-
 # ---------------------------------------------------------------------- a result restricted to one log
 
 

@@ -18,19 +18,6 @@ from diransac.report.rendering import Table
 from diransac.report.runs import Entry, Run
 from diransac.text_table import number, percent, plural, telling_digits
 
-__all__ = [
-    "card",
-    "competitions",
-    "diagnosis",
-    "differences",
-    "interval_text",
-    "lead",
-    "log_tables",
-    "parameters",
-    "scores",
-    "suggestions",
-]
-
 _LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
 """Look of each verdict."""
 

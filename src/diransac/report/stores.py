@@ -19,8 +19,6 @@ from diransac.study.fleet_findings import FleetSummary
 from diransac.study.summary import ParameterErrors, Summary, summarise
 from diransac.text_table import number, percent, plural
 
-__all__ = ["write_fleet_report", "write_study_report"]
-
 _MOST = 200
 """Rows of a table of a fleet, findings and vehicles alike; the page says how many there are more."""
 

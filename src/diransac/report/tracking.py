@@ -15,8 +15,6 @@ from diransac.report.figures import Figure, Panel, Timeline, Trace, padded, time
 from diransac.report.rendering import Table, write_page
 from diransac.text_table import number, percent, plural
 
-__all__ = ["write_tracking_report"]
-
 
 def write_tracking_report(history: History, path: str | Path, *, command: str = "") -> None:
     """Write one HTML page about a tracked run.

@@ -33,8 +33,6 @@ from diransac.plain_text import one_line
 from diransac.report.rendering import encodable
 from diransac.report.runs import Run, simulate_all
 
-__all__ = ["write_recording"]
-
 _MEASURED, _PREDICTED, _OUTLIERS, _OTHER = (120, 120, 120), (31, 119, 180), (214, 39, 40), (44, 160, 44)
 """Colours, red, green and blue."""
 

@@ -14,18 +14,6 @@ from diransac.errors import SettingsError
 from diransac.simulation.compiler.lanes import checked_array, squared_thresholds
 from diransac.simulation.compiler.machine_code import LANES
 
-__all__ = [
-    "ClosedLoopBatch",
-    "GaussNewtonBatch",
-    "LinearFeedback",
-    "LinearizedErrors",
-    "Measurements",
-    "RolloutBatch",
-    "ScoreBatch",
-    "Simulator",
-    "inlier_mask",
-]
-
 
 # Arguments -----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)

@@ -29,19 +29,6 @@ if TYPE_CHECKING:
 
     SimulatedModel: TypeAlias = Model | DisturbedModel
 
-__all__ = [
-    "CALLED",
-    "HOLDS",
-    "INTEGRATORS",
-    "Hold",
-    "Sensitivities",
-    "called_dynamics",
-    "calls_dynamics",
-    "linearized_step",
-    "loop_specification",
-    "sensitivities_of",
-]
-
 Dynamics = Callable[[ca.SX, float], ca.SX]
 """(state and its derivatives, in columns; fraction of the step that has elapsed) -> their rates."""
 

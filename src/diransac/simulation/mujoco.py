@@ -36,8 +36,6 @@ from diransac.simulation.integrators import HOLDS
 if TYPE_CHECKING:
     from diransac.model.mjcf import MujocoModel
 
-__all__ = ["MujocoRollouts"]
-
 _STEP, _STEP_OF_PARAMETERS = 1e-7, 1e-5
 """Differences of states, and of parameters over their sizes: wider ones meet contacts that begin a step earlier."""
 _LANES = 4096

@@ -53,8 +53,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
     from diransac.simulation.integrators import SimulatedModel
 
-__all__ = ["Rollouts", "rollouts"]
-
 OutputName: TypeAlias = Literal[
     "ScoreOutput", "ErrorOutput", "SignalOutput", "GaussNewtonOutput", "LinearizedErrorOutput", "ClosedLoopOutput"
 ]

@@ -30,8 +30,6 @@ from diransac.studio.stages import CALLS_CODE, RESULTS, command, lines
 if TYPE_CHECKING:
     from diransac.identification.result import Result
 
-__all__ = ["Studio", "application"]
-
 _STATIC = Path(__file__).parent / "static"
 _KEEP_ALIVE = 5.0
 _MOST_CELLS = 4000

@@ -11,8 +11,6 @@ from xml.parsers import expat
 from diransac.errors import LogError, ModelError
 from diransac.limits import LARGEST_TABLE, read_bytes
 
-__all__ = ["Folders"]
-
 _LOGS = (
     ".csv",
     ".csv.gz",

@@ -17,8 +17,6 @@ from typing import Any
 from diransac.studio.project import quoted
 from diransac.user_files import CONFIRMED
 
-__all__ = ["Job", "Jobs"]
-
 _LONGEST_LINE, _MOST_STEPS = 1 << 22, 200
 
 

@@ -20,8 +20,6 @@ from diransac.plain_data import toml_file
 from diransac.plain_text import literal, one_line, printable
 from diransac.user_files import file_and_name
 
-__all__ = ["NAME", "Project", "printed", "quoted"]
-
 NAME = "project.diransac.toml"
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]

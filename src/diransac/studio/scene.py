@@ -25,8 +25,6 @@ from diransac.errors import ModelError
 if TYPE_CHECKING:
     from diransac.data.log import Log
 
-__all__ = ["Scenes"]
-
 _FRAMES, _PATIENCE = 500, 30.0
 _MOST_NUMBERS = 30_000_000
 """Coordinates of the corners of all shapes."""

@@ -21,8 +21,6 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from diransac.data.readers.topics import TopicTable
 
-__all__ = ["Logs", "Shown"]
-
 _MOST_NUMBERS, _BLOCK = 150_000_000, 256
 _MOST_SCANNED = 4_000_000
 """Rows of a signal that is searched for outliers."""

@@ -11,8 +11,6 @@ from diransac.errors import SettingsError
 from diransac.plain_text import printable
 from diransac.studio.project import Project, printed, quoted
 
-__all__ = ["CALLS_CODE", "RESULTS", "command", "lines"]
-
 RESULTS = "diransac-results"
 """Folder of what the commands write, below the first folder."""
 CALLS_CODE = {"model", "map", "check", "design", "solve"}

@@ -24,10 +24,6 @@ from diransac.identification.structure.identifiability import of_log
 from diransac.model.plant import DisturbedModel, Plant
 from diransac.simulation.compiler import compile_map
 
-__all__ = [
-    "PlantFacts", "covers", "differ", "is_disturbed", "mean_accelerations", "pseudo_true_parameters", "relative_errors",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class PlantFacts:

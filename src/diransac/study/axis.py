@@ -11,8 +11,6 @@ from pydantic import Field, model_serializer, model_validator
 from diransac.errors import SettingsError
 from diransac.study.tables import Table, Text, flat, is_number, unknown_key
 
-__all__ = ["Axis"]
-
 
 class Axis(Table):
     """The quantity that varies in a study, the table ``[axis]``.

@@ -24,11 +24,6 @@ from diransac.study.plants import PlantChoice
 from diransac.study.specification import ControlChoice, FlightChoice, Study
 from diransac.study.tables import check_whole
 
-__all__ = [
-    "PLANNING_TIME_LIMIT", "TrialData", "check_ended", "derived_seed", "flown", "together", "trial_data",
-    "trial_data_batch", "trial_seed",
-]  # fmt: skip
-
 PLANNING_TIME_LIMIT = 600.0
 """s per plan: long enough for a solver's limit of iterations to end it first on any machine."""
 

@@ -35,8 +35,6 @@ from diransac.simulation import default_threads
 from diransac.study.store import Key, Store, Work
 from diransac.time_limit import time_left, time_limited
 
-__all__ = ["Computation", "Progress", "connected", "run_work"]
-
 Progress = Callable[[int, int], None]
 """Called with (rows present, rows asked for)."""
 

@@ -36,8 +36,6 @@ from diransac.study.engine import Progress, run_work
 from diransac.study.store import AGAIN, FLEET, LARGEST, Key, Kind, Store, damage, quoted, word
 from diransac.study.trials import versions
 
-__all__ = ["FleetRows", "FleetStatus", "export_fleet", "fleet_status", "identify_each", "read_fleet"]
-
 
 def identify_each(
     model: Model,

@@ -30,8 +30,6 @@ from diransac.identification.regression.uncertainty import student_quantile
 from diransac.study.fleet import FleetRows, FleetStatus, read_fleet
 from diransac.text_table import aligned, number, plural
 
-__all__ = ["Change", "Drift", "FleetSummary", "ParameterInFleet", "VehicleOutlier", "summarise_fleet"]
-
 _HUBER = 1.345
 """Standardised residual from which on Huber's mean bounds the influence of a value: 95 % efficiency."""
 _EFFICIENCY = 0.95

@@ -13,8 +13,6 @@ from diransac.plain_data import read_text, toml_table
 from diransac.study.specification import Study
 from diransac.study.tables import changed
 
-__all__ = ["builtin_names", "load", "template"]
-
 _FOLDER = files("diransac.study")
 
 

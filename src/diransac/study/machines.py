@@ -17,8 +17,6 @@ from diransac.model.derivation import Symbols
 from diransac.model.library import TABLE_I, builtin
 from diransac.model.plant import Disturbance, Plant
 
-__all__ = ["double_pendulum", "pendulum", "rotorcraft_in_gusts", "servo_axis", "underwater_vehicle"]
-
 PARAMETERS: Mapping[str, Mapping[str, float]] = MappingProxyType({
     # kg, N s/m, N, N: an axis of the size of EMPS.
     "servo axis": {"mass": 95.0, "viscous_friction": 200.0, "dry_friction": 20.0, "offset": -12.0},

@@ -22,8 +22,6 @@ from diransac.identification.methods import (
 from diransac.identification.settings import Settings
 from diransac.study.tables import OneOf, Table, Text
 
-__all__ = ["TRUE", "MethodChoice", "methods_of"]
-
 TRUE = "true"
 """Method that identifies nothing: its parameters are the plant's own."""
 

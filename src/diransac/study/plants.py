@@ -24,8 +24,6 @@ from diransac.study.machines import double_pendulum, pendulum, rotorcraft_in_gus
 from diransac.study.tables import RANDOM, FunctionTable, Text, check_signature, function_arguments
 from diransac.user_files import blaming, definitions, file_and_name, running
 
-__all__ = ["PlantChoice"]
-
 
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:
     """The planar rotorcraft without any disturbance."""

@@ -26,8 +26,6 @@ from diransac.text_table import aligned
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Status", "TrialCounts", "about", "export", "paths", "read", "status"]
-
 
 # Rows -------------------------------------------------------------------------------------------
 def read(store: str | Path) -> pl.DataFrame:

@@ -49,11 +49,6 @@ from diransac.study.tables import (
     unknown_key,
 )
 
-__all__ = [
-    "MISSIONS", "TRAJECTORIES", "ControlChoice", "Criteria", "FlightChoice", "Missions",
-    "Study", "planned_path",
-]  # fmt: skip
-
 MISSIONS: dict[str, Callable[..., Trajectory]] = {"square": square, "star": star, "sine": sine}
 """Trajectories that identified models are evaluated on."""
 

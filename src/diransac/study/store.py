@@ -34,8 +34,6 @@ from diransac.errors import StudyError
 from diransac.plain_data import json_data
 from diransac.plain_text import one_line
 
-__all__ = ["AGAIN", "FLEET", "LARGEST", "STUDY", "Key", "Kind", "Store", "Work", "damage", "quoted", "word"]
-
 Key = tuple[Any, ...]
 """Values of the columns that name a row."""
 

@@ -21,8 +21,6 @@ from diransac.study.store import Store, damage
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["ParameterErrors", "Summary", "TrackingErrors", "summarise"]
-
 _Statistic = Callable[[FloatArray], np.floating]
 
 

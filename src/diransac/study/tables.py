@@ -32,11 +32,6 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 from diransac.errors import SettingsError
 from diransac.limits import MOST_COUNTED
 
-__all__ = [
-    "RANDOM", "Count", "Flag", "FunctionTable", "OneOf", "Table", "Text", "Whole", "changed", "check_signature",
-    "check_whole", "flat", "function_arguments", "is_number", "takes_options", "unknown_key",
-]  # fmt: skip
-
 RANDOM = "random"
 """Value of an argument that is drawn anew for each trial."""
 

@@ -49,8 +49,6 @@ from diransac.study.reading import Status, status
 from diransac.study.specification import ControlChoice, Study, planned_path
 from diransac.study.store import Key
 
-__all__ = ["STAGES", "run_study", "run_trials", "versions"]
-
 STAGES = ("record", "identify", "plan", "steer", "fly")
 """Stages that `seconds` is divided by."""
 

@@ -12,8 +12,6 @@ from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import staged
 from diransac.cli.robot_options import RobotOptions
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

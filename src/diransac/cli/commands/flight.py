@@ -21,8 +21,6 @@ from diransac.cli.options import JsonFlag, ModelName, ResultFile
 from diransac.cli.outputs import staged
 from diransac.identification.result import Result
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

@@ -32,8 +32,6 @@ from diransac.identification.methods import DEFAULT, METHODS
 from diransac.identification.result import Result
 from diransac.time_limit import time_limited
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

@@ -26,8 +26,6 @@ from diransac.data.readers import read_fields, read_topics
 from diransac.identification.assessment.inspection import inspect
 from diransac.simulation.compiler.code_cache import CodeCache
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

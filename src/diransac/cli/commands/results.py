@@ -27,8 +27,6 @@ from diransac.cli.outputs import PAGE, check_ending, staged
 from diransac.errors import SettingsError
 from diransac.identification.result import Result
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

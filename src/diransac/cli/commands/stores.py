@@ -16,13 +16,11 @@ from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import PAGE, check_ending, checked, staged
 from diransac.cli.rows import Cluster, Jobs, running
 from diransac.errors import SettingsError
-from diransac.identification.identify import METHODS
+from diransac.identification.methods import METHODS
 from diransac.study import builtin_names, export, fleet_status, load, run_study, status, summarise_fleet, template
 from diransac.study.fleet import export_fleet
 from diransac.study.method_choice import TRUE
 from diransac.text_table import aligned
-
-__all__ = ["app"]
 
 app, study, fleet = (typer.Typer(add_completion=False) for _ in range(3))
 app.add_typer(study, name="study", help="Run grids of Monte-Carlo trials, such as the paper's figures.")

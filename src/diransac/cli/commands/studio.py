@@ -11,8 +11,6 @@ import typer
 
 from diransac.cli import screen
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

@@ -38,8 +38,6 @@ from diransac.model import Model
 if TYPE_CHECKING:
     from diransac.data.readers.growing import Growing
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = ["continuous", "continuous_quaternions", "interpolated", "unit_quaternions", "unwrap", "whole_quaternions"]
-
-
 _WINDOW, _PERSISTS = 25, 5
 """Samples of the running medians."""
 _CLOSE, _FAR = 0.05, 0.25

@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = ["Bandwidth", "acting_inputs", "choose_bandwidth", "differentiate", "filter_rows"]
-
-
 _LONGEST_BRIDGE = 0.25
 """Gaps that are bridged, at most, in periods of the bandwidth."""
 _HIGHEST = 0.1

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
     from diransac.data.log import Log
 
-__all__ = ["despike", "hampel", "running_deviation", "window_deviation"]
-
-
 _MAD_TO_STD = 1.4826
 
 

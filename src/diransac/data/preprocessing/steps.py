@@ -23,25 +23,6 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-__all__ = [
-    "check_factor",
-    "describe_resampling",
-    "in_units",
-    "interpolate_at",
-    "keep_while",
-    "leave_out",
-    "origins_of",
-    "prepared",
-    "rename",
-    "rename_columns",
-    "resample",
-    "resample_columns",
-    "resampling_grid",
-    "scale",
-    "shift",
-    "unit_factors",
-]
-
 Column = TypeVar("Column")
 
 _ROUNDING = 1e-6

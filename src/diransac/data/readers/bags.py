@@ -25,8 +25,6 @@ from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_
 from diransac.data.readers.table import DAMAGE, undamaged
 from diransac.errors import LogError
 
-__all__ = ["BagRecording", "McapFile", "RosBag", "damages", "open_bag", "open_mcap", "unpacked"]
-
 INSTALL = 'install them with pip install "diransac[logs]"'
 LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-__all__ = ["fields_of", "head_of", "joined", "read_csv", "read_csv_gz"]
-
 _SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _FEW_LINES = 20_000
 _COMMENTS = ("#", "%", "//")

@@ -20,8 +20,6 @@ from diransac.data.readers.recording import Recording, Samples, Stamps
 from diransac.data.readers.table import undamaged
 from diransac.errors import LogError
 
-__all__ = ["MAGIC", "CrazyflieRecording"]
-
 MAGIC = b"\xbc"
 _STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
 _MOST_EVENTS, _MOST_VARIABLES = 256, 1024

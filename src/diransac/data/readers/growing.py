@@ -31,8 +31,6 @@ from diransac.plain_text import one_line
 if TYPE_CHECKING:
     from diransac.data.readers.reading import Reading
 
-__all__ = ["FileEnd", "Growing", "GrowingCsv", "GrowingMcap", "Part", "Pipe", "growing"]
-
 Part = tuple[dict[str, FloatArray], dict[str, str]]
 """Columns of some rows, with the time ``t`` in seconds, and the units that are known."""
 

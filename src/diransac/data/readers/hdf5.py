@@ -15,8 +15,6 @@ from diransac.data.readers.table import Table, check_shapes, table_of_arrays, un
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
-__all__ = ["MAGIC", "read_hdf5"]
-
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _MOST_LINKS = 2 * MOST_COLUMNS
 _MOST_CHUNKS = 200_000

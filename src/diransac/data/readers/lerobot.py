@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-__all__ = ["LerobotDataset"]
-
 _EPISODE = re.compile(r"(?:episode_|train-)(\d{1,9})(?:-of-\d{1,9})?\.parquet")
 _FILE = re.compile(r"file-\d{1,9}\.parquet")
 _INDEX = "episode_index"

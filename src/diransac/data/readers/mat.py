@@ -23,8 +23,6 @@ from diransac.data.readers import hdf5
 from diransac.data.readers.table import Table, check_unique, table_of_arrays, undamaged
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
-__all__ = ["read_mat"]
-
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _STRUCTURE, _COMPLEX = 2, 0x0800

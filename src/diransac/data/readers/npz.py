@@ -22,8 +22,6 @@ from diransac.data.readers.table import (
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, beyond
 
-__all__ = ["read_npz"]
-
 
 def read_npz(data: bytes, source: str) -> Table:
     """Table of an NPZ file.

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     import polars as pl
 
-__all__ = ["is_numeric", "numbers_of", "read_parquet", "scanned"]
-
 _MAGIC = b"PAR1"
 
 

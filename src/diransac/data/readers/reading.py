@@ -25,8 +25,6 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.data.mapping import LogMapping
 
-__all__ = ["Reading"]
-
 
 @dataclass(frozen=True)
 class Reading:

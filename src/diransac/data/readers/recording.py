@@ -15,8 +15,6 @@ from diransac.data.preprocessing.steps import describe_resampling, interpolate_a
 from diransac.errors import LogError
 from diransac.text_table import some
 
-__all__ = ["Aligned", "Recording", "Samples", "Stamps", "align", "find_field", "seconds_since", "shortened"]
-
 Stamps = str
 """``"header"``: time at which a message says it was sampled; ``"message"``: time at which it was recorded."""
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from diransac.data.readers.table import Table
 
-__all__ = ["REPAIRS", "Repairs"]
-
 REPAIRS = {
     "comments": "comments and blank lines of CSV text are left out",
     "preamble": "lines of CSV text above its header are left out",

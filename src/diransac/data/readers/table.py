@@ -25,12 +25,6 @@ from diransac.errors import LogError
 from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
 from diransac.plain_text import one_line
 
-__all__ = [
-    "DAMAGE", "Table", "check_shapes", "check_size", "check_unique", "readable", "seconds", "table_of_arrays",
-    "time_column", "undamaged", "unit_of_name", "with_metadata",
-]  # fmt: skip
-
-
 DAMAGE: tuple[type[Exception], ...] = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError, NotImplementedError),
     *(OSError, EOFError, MemoryError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile),

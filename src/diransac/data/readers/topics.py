@@ -22,20 +22,6 @@ if TYPE_CHECKING:
 
     from diransac.data.readers.repair import Repairs
 
-__all__ = [
-    "TopicFacts",
-    "TopicTable",
-    "entries_of",
-    "is_one_table",
-    "list_topics",
-    "mapped_table",
-    "signals_of",
-    "table_of_topics",
-    "wanted_by",
-    "whole_topic",
-]
-
-
 # ---------------------------------------------------------------------- tables
 
 

@@ -22,8 +22,6 @@ from diransac.data.checks import as_doubles
 from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
 from diransac.errors import LogError
 
-__all__ = ["UlogRecording"]
-
 _HEADER = struct.Struct("<HB")
 _KNOWN = frozenset(b"FDIMPQARSOLCB")
 _TYPES = {

@@ -23,19 +23,6 @@ from diransac.errors import PlanningError, SettingsError
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = [
-    "FourierSeries",
-    "Limit",
-    "Limited",
-    "Observed",
-    "check_rest",
-    "drawn_motion",
-    "grid",
-    "motion_of",
-    "ranges_of",
-    "resting_pose",
-]
-
 Limit: TypeAlias = float | tuple[float, float]
 """Largest magnitude, or lowest and highest value."""
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-__all__ = ["Experiment", "design_experiment"]
-
 Outputs: TypeAlias = Callable[..., Mapping[str, Any]]
 
 _N_DRAWS = 9

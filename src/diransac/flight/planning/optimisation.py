@@ -27,8 +27,6 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.flight.planning.excitation import FourierSeries, Limited, Observed, grid, motion_of
 
-__all__ = ["DesignProblem", "Search", "best_motion"]
-
 _LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
 """Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-__all__ = ["plan"]
-
 _DIGITS = 9
 """Decimals of a time in s, within which equal moments computed in different ways agree."""
 

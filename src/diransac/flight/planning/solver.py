@@ -22,8 +22,6 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.flight.planning.transcription import Program
 
-__all__ = ["TIME_LIMIT", "Solution", "Strategy", "interior_point"]
-
 Strategy: TypeAlias = Literal["line search", "warm start", "full steps"]
 """``warm start``: the guess is close to the solution, the barrier starts small; ``full steps``: without line search."""
 

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 
-__all__ = ["Costs", "Stage", "Stages", "stage_of"]
-
-
 @dataclass(frozen=True)
 class Costs:
     """Cost of knots and intervals: ``tau (w_t + sum_i e_i (u_i - trim_i)^2) + sum_j w_j (x_j - ref_j)^2``.

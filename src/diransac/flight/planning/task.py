@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-__all__ = ["TIME_STEP", "InputLimits", "Limits", "Reference", "Task", "Waypoint", "sampled", "task_of"]
-
 TIME_STEP = 0.01
 """Time from row to row of a plan, s: flights are simulated and controlled at 100 Hz."""
 

@@ -35,22 +35,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-__all__ = [
-    "INPUT_LIMIT_FRACTION",
-    "MAX_DURATION",
-    "MEAN_SPEED",
-    "ROTORCRAFT_LIMITS",
-    "check_fully_actuated",
-    "check_numbers",
-    "check_plane",
-    "inverse_dynamics",
-    "multisine",
-    "random_waypoints",
-    "sine",
-    "square",
-    "star",
-]
-
 CORNERS = ((2.0, 2.0), (2.0, -2.0), (-2.0, -2.0), (-2.0, 2.0))
 """Corners of the square, x and z, m: sides of 4 m around the origin."""
 

@@ -23,8 +23,6 @@ from diransac.flight.planning.stage import Costs, Stages, stage_of
 from diransac.flight.planning.task import TIME_STEP, Task, sampled
 from diransac.flight.trajectory import Trajectory
 
-__all__ = ["Guess", "Program"]
-
 Guess: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 """Times (K,), s from the start; states (K, n_x) at them; inputs (K, n_u), held from each time on."""
 

@@ -20,8 +20,6 @@ from diransac.model import Model
 from diransac.text_table import aligned
 from diransac.time_limit import check_time, time_limited
 
-__all__ = ["CrossValidation", "cross_validate"]
-
 
 @dataclass(frozen=True)
 class CrossValidation:

@@ -19,8 +19,6 @@ from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.observers import driven_states
 from diransac.model import Model
 
-__all__ = ["HorizonScores", "OpenLoop", "StartRule", "derived_velocities", "pooled_scores"]
-
 StartRule = Literal["smoothed", "measured"]
 
 

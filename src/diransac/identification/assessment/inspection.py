@@ -28,8 +28,6 @@ from diransac.identification.structure.structural import structural
 from diransac.model import Model
 from diransac.text_table import aligned, percent
 
-__all__ = ["Excitation", "Fitness", "Inspection", "SignalFacts", "inspect"]
-
 
 @dataclass(frozen=True)
 class SignalFacts:

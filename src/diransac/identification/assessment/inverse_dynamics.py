@@ -23,8 +23,6 @@ from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.model import Model
 
-__all__ = ["PredictedForces", "force_errors", "predicted_forces"]
-
 
 @dataclass(frozen=True)
 class PredictedForces:

@@ -24,8 +24,6 @@ from diransac.identification.settings import finite_number
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 
-__all__ = ["resolution_of", "simulate"]
-
 
 def simulate(
     plant: ModelWithParameters,

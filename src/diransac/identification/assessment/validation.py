@@ -28,8 +28,6 @@ from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.text_table import aligned, listed, number, percent
 
-__all__ = ["Validation", "validate"]
-
 _GOOD = 0.1
 """Relative error of predictions of held-out logs up to which a model is good."""
 _TELLING = 0.1

@@ -30,8 +30,6 @@ from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_st
 from diransac.identification.methods.lo_diransac.without_equations import followed
 from diransac.identification.regression.uncertainty import robust_std
 
-__all__ = ["SmoothedLog", "WindowStarts", "followed_log", "smoothed_log", "window_starts"]
-
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
 _SOFT = 3.0

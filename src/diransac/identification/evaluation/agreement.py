@@ -13,9 +13,6 @@ from diransac.identification.method import Callback, Method, fit, within
 from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
 
-__all__ = ["disagreements"]
-
-
 _DELAY = "input delay [s]"
 """Name of the delay of the inputs in a sentence."""
 

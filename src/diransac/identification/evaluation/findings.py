@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Parameter
 
-__all__ = ["bounds_text", "findings_of"]
-
-
 _NEAR = 0.05
 """Median error of a simulation, over the range of the signal, up to which it is good."""
 _HALF = 0.5

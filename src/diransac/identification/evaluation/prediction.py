@@ -19,19 +19,6 @@ from diransac.identification.evaluation.scoring import Scoring, as_estimated
 from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.settings import Settings
 
-__all__ = [
-    "Restarts",
-    "SimulatedLog",
-    "diagnosed_parts",
-    "predictions",
-    "restart_rows",
-    "restarts_of",
-    "simulated_parts",
-    "simulated_rows",
-    "unexplained",
-]
-
-
 # ---------------------------------------------------------------------- simulations
 
 

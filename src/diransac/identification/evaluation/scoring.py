@@ -18,9 +18,6 @@ from diransac.identification.evaluation.simulation import Simulation, Stretch, s
 from diransac.identification.settings import Settings
 from diransac.model import Model
 
-__all__ = ["Scoring", "as_estimated", "choose_scoring", "evaluate", "judged_signals", "mean_squared_error", "rms_error"]
-
-
 # ---------------------------------------------------------------------- weights and thresholds
 
 

@@ -14,8 +14,6 @@ from diransac.data.segment import Segment
 from diransac.identification.diagnosis import Resolution
 from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, Simulator, default_threads, rollouts
 
-__all__ = ["LogScores", "Scores", "Simulation", "Stretch", "stretches_of"]
-
 
 @dataclass(frozen=True)
 class Scores:

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from diransac.identification.method import Callback
     from diransac.model import Model
 
-__all__ = ["LeastSquares", "bound_to", "fitted"]
-
 
 @dataclass(frozen=True)
 class LeastSquares:

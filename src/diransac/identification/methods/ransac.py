@@ -36,15 +36,6 @@ if TYPE_CHECKING:
     from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Model
 
-__all__ = [
-    "Diransac",
-    "IDiransac",
-    "NothingAcceptedError",
-    "RansacMethod",
-    "SearchState",
-    "search",
-]
-
 _OUT_OF_BOUNDS = "out of bounds"
 _SEARCH = ("sample_size", "max_iterations", "refit")
 

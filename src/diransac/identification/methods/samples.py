@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from diransac.identification.regression.estimators import BoundEstimator
     from diransac.identification.settings import Settings
 
-__all__ = ["Evaluator", "FittedSamples", "Hypothesis", "Samples", "Score", "ScoredBatch", "fingerprint"]
-
 Sampler = Callable[[int, IntArray, int, int, int], IntArray]
 
 

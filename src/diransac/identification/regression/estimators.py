@@ -28,9 +28,6 @@ from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, null_space, regression
 from diransac.identification.regression.uncertainty import score_inflation
 
-__all__ = ["BoundEstimator", "Estimator", "OrdinaryLeastSquares", "Selection", "TotalLeastSquares"]
-
-
 MIN_EIGENVALUE = 1e-6
 # Noise of a fit with priors at least, over the RMS of b.
 _LEAST_NOISE = 1e-5
@@ -255,6 +252,7 @@ class BoundSums:
         self._has_prior = np.isfinite(self._prior_std)
 
     def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        """See `BoundEstimator.select`."""
         gram, n_rows = self.gram(row_sets), np.array([len(rows) for rows in row_sets])
         return Selection(partial(self._well_defined, gram), partial(self.solve, gram, n_rows))
 
@@ -263,10 +261,12 @@ class BoundSums:
         return np.asarray(least > self._estimator.min_eigenvalue)
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        """See `BoundEstimator.fit_without`."""
         left = len(rows) - np.array([len(group) for group in groups])
         return self.solve(self.gram([rows]) - self.gram(groups), left)
 
     def prior_shifts(self, rows: IntArray) -> FloatArray:
+        """See `BoundEstimator.prior_shifts`."""
         gram, n = self.gram([rows]), np.array([len(rows)])
         shifted = [self.solve(gram, n, shift)[0] for shift in self.unit_shifts()]
         return np.array(shifted).reshape(-1, self._n_p) - self.solve(gram, n)
@@ -276,10 +276,12 @@ class BoundSums:
         return np.asarray(np.diag(np.where(self._has_prior, self._prior_std, 0.0))[self._has_prior])
 
     def null_space(self) -> NullSpace:
+        """See `BoundEstimator.null_space`."""
         gram = self._counting_priors(self.gram([np.arange(self.n_rows)])[0, :-1, :-1])
         return null_space(gram, self.scale[:-1], self._estimator.min_eigenvalue)
 
     def correlations(self) -> FloatArray:
+        """See `BoundEstimator.correlations`."""
         gram = self.gram([np.arange(self.n_rows)])
         prior = self.prior_sums(gram, np.array([self.n_rows]))
         own = gram[0, :-1, :-1]

@@ -15,8 +15,6 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.regression.estimators import solve_definite
 from diransac.time_limit import check_time
 
-__all__ = ["LeastSquaresProblem", "least_squares"]
-
 # Bounds of Marquardt's damping: the last is a step of nothing.
 _BOUNDS = (1e-9, 1e9)
 

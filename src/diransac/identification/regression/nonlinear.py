@@ -36,9 +36,6 @@ from diransac.identification.regression.uncertainty import rows_without, score_i
 from diransac.model import Model, Parameter
 from diransac.simulation.compiler import Map
 
-__all__ = ["NonlinearLeastSquares", "ParameterChart"]
-
-
 _ROWS_FOR_STARTS = 100
 # Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
 _LOG_BOUND = 27.6
@@ -145,6 +142,7 @@ class BoundNonlinear:
             self._inflation = score_inflation(scores, self._blocks.sum(axis=0), float(np.square(errors).mean()))
 
     def select(self, row_sets: Sequence[IntArray]) -> Selection:
+        """See `BoundEstimator.select`."""
         return Selection(partial(self.well_defined, row_sets), partial(self.fit, row_sets))
 
     def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
@@ -153,6 +151,7 @@ class BoundNonlinear:
         return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
 
     def null_space(self) -> NullSpace:
+        """See `BoundEstimator.null_space`."""
         gram = self._blocks.sum(axis=0) + self._counted_priors()
         return null_space(gram, self._column_scale, self._settings.min_eigenvalue)
 
@@ -172,6 +171,7 @@ class BoundNonlinear:
         return bool((smallest_eigenvalue(gram) > self._settings.min_eigenvalue).any()) if len(J) else False
 
     def correlations(self) -> FloatArray:
+        """See `BoundEstimator.correlations`."""
         return correlations(self._blocks.sum(axis=0) + self._counted_priors())
 
     def _counted_priors(self) -> FloatArray:
@@ -179,6 +179,7 @@ class BoundNonlinear:
         return np.diag(np.isfinite(self._layout.prior_std).astype(float))
 
     def prior_shifts(self, rows: IntArray) -> FloatArray:
+        """See `BoundEstimator.prior_shifts`."""
         here = self._fit_equal(rows[None])
         start = self.chart.to_free(here)[:, None]
         shifts = np.diag(self._layout.prior_std)[self._layout.with_prior]
@@ -198,6 +199,7 @@ class BoundNonlinear:
         return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        """See `BoundEstimator.fit_without`."""
         start = self.chart.to_free(self._fit_equal(rows[None]))[:, None]
         return np.array([self._likeliest(rows_without(rows, group)[None], start)[0] for group in groups])
 

@@ -35,8 +35,6 @@ from diransac.model import Model, Parameter
 from diransac.model.derivation import Symbols
 from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
-__all__ = ["ObserverFit", "driven_states", "observers"]
-
 _N_STARTS = 256
 """Starts at most."""
 _TURN = 2.0 * np.pi

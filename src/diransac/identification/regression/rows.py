@@ -22,21 +22,6 @@ from diransac.identification.regression.uncertainty import CLEAR
 from diransac.model import Model
 from diransac.simulation.compiler import compile_map
 
-__all__ = [
-    "PART_OF_NULL_VECTOR",
-    "MotionRows",
-    "NullSpace",
-    "Solution",
-    "excited",
-    "motion_rows",
-    "null_space",
-    "outside_bounds",
-    "regression",
-    "regression_rows",
-    "residual_slopes",
-    "solved",
-]
-
 _TINY = 1e-300
 
 

@@ -23,8 +23,6 @@ from diransac.identification.regression.estimators import (
 from diransac.identification.regression.rows import NullSpace, regression
 from diransac.identification.regression.uncertainty import rows_without
 
-__all__ = ["LinearRegressor", "ScikitLearnEstimator", "as_estimator", "name_of"]
-
 
 class LinearRegressor(Protocol):
     """Interface of scikit-learn's linear regressors."""

@@ -17,19 +17,6 @@ if TYPE_CHECKING:
     from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Parameter
 
-__all__ = [
-    "CLEAR",
-    "N_BLOCKS",
-    "combined",
-    "jackknife_covariance",
-    "robust_std",
-    "rows_without",
-    "score_inflation",
-    "student_quantile",
-    "students_draws",
-]
-
-
 # Few and long: intervals have their nominal coverage while residuals are correlated over up to an eighth of a stretch
 # (tests/test_uncertainty.py), 0.3 s of a log of 25 s; with 30 stretches it would be 0.1 s.
 N_BLOCKS = 10

@@ -27,8 +27,6 @@ from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS, S
 from diransac.model import Model, expressions
 from diransac.model.derivation import Symbols, call_user
 
-__all__ = ["CandidateTerm", "CandidateTerms", "TermLibrary", "candidate_terms"]
-
 TermLibrary = Callable[[Symbols, Symbols, Symbols], Mapping[str, Any]]
 """A user's candidates: ``library(q, v, u)`` returns expressions by name, each of which is tried in every equation."""
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
     Solver = Callable[[Model, ParameterLayout, Sequence[MotionRows]], Solution | None]
 
-__all__ = ["Mistake", "contradictions", "explanations", "mistakes_of_columns"]
-
 # Units in which columns are recorded by mistake; those of another dimension than the model's are none.
 _UNITS: tuple[str, ...] = ("rad", "deg", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
 _UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m", "Pa", "kPa", "bar", "V", "mV")

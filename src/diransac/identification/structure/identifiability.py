@@ -19,18 +19,6 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.regression.rows import PART_OF_NULL_VECTOR, NullSpace
 
-__all__ = [
-    "Ambiguity",
-    "ambiguity_of",
-    "collinear",
-    "components",
-    "in_words",
-    "joined",
-    "of_log",
-    "of_logs",
-    "vague_parameters",
-]
-
 # Largest difference of equal projectors.
 _SAME = 1e-5
 

@@ -32,8 +32,6 @@ from diransac.model import Model, expressions
 if TYPE_CHECKING:
     from diransac.identification.estimate import Estimate
 
-__all__ = ["KnownParameters"]
-
 
 @dataclass(frozen=True)
 class KnownParameters:

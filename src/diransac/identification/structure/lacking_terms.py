@@ -25,19 +25,6 @@ from diransac.arrays import FloatArray
 from diransac.identification.serialization import Number, Values
 from diransac.model import Model, Parameter, expressions
 
-__all__ = [
-    "INPUT_CHANGES",
-    "INPUT_GAIN",
-    "KINDS",
-    "PossibleTerm",
-    "StructuralUncertainty",
-    "Suggestion",
-    "check_terms",
-    "largest",
-    "mixture_intervals",
-    "with_terms",
-]
-
 INPUT_GAIN, _RICHER = "input gain", "richer motion of {place}"
 INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
 """Kinds of the terms that change an input."""

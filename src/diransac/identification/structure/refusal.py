@@ -23,8 +23,6 @@ from diransac.identification.structure.identifiability import Ambiguity, in_word
 from diransac.identification.structure.structural import Ranges, structural
 from diransac.model import Model
 
-__all__ = ["cause_of_refusal", "check_known_terms", "check_motion", "check_signs"]
-
 _ADVICE = "compare the terms, constants and bounds of the model with the machine"
 
 

@@ -30,9 +30,6 @@ from diransac.identification.structure.identifiability import (
 )
 from diransac.model import Model, Parameter
 
-__all__ = ["Ranges", "check_structure", "structural", "structural_slopes", "unidentifiable"]
-
-
 # Half the range of a signal of which no log shows it.
 _HALF_RANGE = 10.0
 

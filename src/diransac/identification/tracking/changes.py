@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.window import Linearization, Window
 
-__all__ = ["Changes"]
-
 # Time over which the scatter of the tests, and drifts, are remembered, s.
 _MEMORY = 60.0
 # Ages that are tested at most: those of a window of 2^30 intervals.

@@ -17,8 +17,6 @@ from diransac.text_table import number
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = ["Change", "History", "TrackedEstimate", "change_text"]
-
 # Estimates that are kept: a figure has fewer cells than a tenth of it.
 _MOST = 20_000
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["explanations_by_forces", "gain_of_freedom", "with_forces"]
-
 # Correlation of unmodelled accelerations that are larger than usual.
 _GUST = 0.9
 

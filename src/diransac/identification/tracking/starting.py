@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.stream import Stream
     from diransac.model import Model
 
-__all__ = ["ColdStart", "Setup", "Start", "begun", "smoothed_motion"]
-
 
 @dataclass(frozen=True)
 class Setup:

@@ -22,8 +22,6 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from diransac.identification.tracking.window import Linearization
 
-__all__ = ["ChangeTests", "ages_of", "change_tests", "fine_ages_of"]
-
 
 @dataclass(frozen=True)
 class ChangeTests:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.window import Window
     from diransac.model import Model
 
-__all__ = ["SensorWatch", "Stream"]
-
 # Stamps from which the interval of the grid is measured first.
 _FIRST_STAMPS = 25
 # Rows without a stamp from which on a new stretch may begin: as `data.segment.silent_rows`.

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Window
 
-__all__ = ["is_surprised", "weights_of_free_motion"]
-
 # Standard deviation of parameters that are held, over their values.
 _HELD = 1e-6
 

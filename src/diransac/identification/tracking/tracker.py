@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
     from diransac.identification.tracking.window import Window
 
-__all__ = ["Tracker", "refused_if_none", "track"]
-
 Samples = Log | Mapping[str, npt.ArrayLike]
 
 # Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother.

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stream import Stream
 
-__all__ = ["AS_LIKELY", "Linearization", "Window"]
-
 # Steps at most with another interval.
 _MOST_STEPS = 3
 AS_LIKELY = 5.0

@@ -6,8 +6,6 @@ from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 
-__all__ = ["dc_motor", "flexible_joint", "servo_axis"]
-
 
 def servo_axis() -> Model:
     """Model ``M q'' + Fv q' + Fc sign(q') + F0 = F`` of a linear axis with viscous and dry friction.

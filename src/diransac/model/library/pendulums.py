@@ -6,8 +6,6 @@ from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 
-__all__ = ["cart_pole", "double_pendulum"]
-
 
 def cart_pole(gravity: float = 9.81, upright: bool = False) -> Model:
     """Model of a pole that swings freely on a driven cart, in five base parameters.

@@ -13,8 +13,6 @@ from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.sensors import accelerometer, gyroscope
 
-__all__ = ["quadrotor"]
-
 Rotor = tuple[float, float, int]
 
 _AXES, _ATTITUDE = ("x", "y", "z"), ("qw", "qx", "qy", "qz")

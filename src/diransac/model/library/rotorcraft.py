@@ -14,8 +14,6 @@ from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.plant import Disturbance, Plant, check_possible
 
-__all__ = ["BLADE_FLAPPING", "TABLE_I", "extended_rotorcraft", "planar_rotorcraft"]
-
 
 def planar_rotorcraft(arm_length: float = 0.177, gravity: float = 9.81) -> Model:
     """Model of two rotors in the vertical plane, with induced drag.

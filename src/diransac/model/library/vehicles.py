@@ -8,8 +8,6 @@ from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.sensors import Sensor
 
-__all__ = ["differential_drive", "single_track_vehicle", "underwater_vehicle"]
-
 
 def underwater_vehicle() -> Model:
     """Model ``m x'' + d1 x' + d2 |x'| x' + b = T`` of an underwater vehicle in decoupled motion along one axis.

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from diransac.model.mjcf.masks import Unknown
     from diransac.model.mjcf.model import MujocoModel
 
-__all__ = ["calibrated_text"]
-
 
 def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
     """Text of an MJCF with estimates in it, and the parameters that are not in it.

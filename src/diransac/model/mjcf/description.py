@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 
     from diransac.model.robots.actuation import Actuation
 
-__all__ = [
-    "JointColumns", "SensorColumns", "compiled_of", "compiled_text", "file_drives", "joint_columns", "sensor_columns",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class JointColumns:

@@ -16,8 +16,6 @@ from diransac.model.parameter import Parameter
 if TYPE_CHECKING:
     from diransac.model.mjcf.description import SensorColumns
 
-__all__ = ["ARRAYS", "FIELDS", "Place", "Unknown", "unknowns_of"]
-
 
 @dataclass(frozen=True)
 class Field:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from diransac.model.mjcf.description import JointColumns, SensorColumns
     from diransac.model.robots.actuation import Actuation
 
-__all__ = ["MujocoModel", "mujoco"]
-
 
 def mujoco(
     path: str | Path,

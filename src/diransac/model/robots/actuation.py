@@ -15,8 +15,6 @@ import numpy as np
 
 from diransac.errors import ModelError
 
-__all__ = ["FORCE", "Actuation", "JointTorques", "MotorCurrents", "PositionControl", "drive_forces"]
-
 FORCE = "{}_torque"
 """Name of the force of a joint's drive."""
 

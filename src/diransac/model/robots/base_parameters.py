@@ -14,8 +14,6 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 
-__all__ = ["Grouping", "base_parameters"]
-
 
 @dataclass(frozen=True)
 class Grouping:

@@ -18,8 +18,6 @@ from diransac.model.robots.consistency import consistent_parameters, inconsisten
 from diransac.model.robots.description import Description, Joint, read_description
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 
-__all__ = ["Document", "calibrated", "impossible_changes", "numbers"]
-
 
 def calibrated(
     path: str | Path, parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray

@@ -22,8 +22,6 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError
 from diransac.model.robots.rigid_body import inertial_parameters, pseudo_inertia
 
-__all__ = ["consistent_parameters", "inconsistency"]
-
 _BASIS = [np.array(ca.DM(pseudo_inertia([float(i == k) for i in range(10)]))) for k in range(10)]
 
 

@@ -24,8 +24,6 @@ from diransac.limits import MOST_JOINTS, beyond
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
 
-__all__ = ["Body", "Coupling", "Description", "Joint", "mujoco_module", "parsed", "read_description"]
-
 _ALONE = threading.Lock()
 """Held while warnings are dropped, which all threads share."""
 _FAILURES = (ValueError, RuntimeError, MemoryError)

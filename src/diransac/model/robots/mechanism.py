@@ -20,8 +20,6 @@ from diransac.model.robots.base_parameters import base_parameters
 from diransac.model.robots.description import Coupling, Description, Joint
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters, inverse_dynamics, pseudo_inertia
 
-__all__ = ["UNKNOWN", "Mechanism", "identifier", "ordered_couplings"]
-
 
 class _Motion(NamedTuple):
     """Position, velocity and acceleration of a joint, and its velocity per velocity of its coordinate."""

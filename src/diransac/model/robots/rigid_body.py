@@ -18,8 +18,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.model.robots.description import Body, Description, Joint
 
-__all__ = ["INERTIAL_NAMES", "inertial_parameters", "inverse_dynamics", "pseudo_inertia"]
-
 INERTIAL_NAMES = ("mass", "hx", "hy", "hz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Inertial parameters of a body about the origin of its frame: mass, kg, first moments, kg m, inertia, kg m^2."""
 

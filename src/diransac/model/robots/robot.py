@@ -18,8 +18,6 @@ from diransac.model.robots.description import Description, read_description
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
 from diransac.model.robots.rigid_body import position_of
 
-__all__ = ["body_position", "coordinates_of_bodies", "robot", "robot_limits"]
-
 
 def robot(
     path: str | Path,

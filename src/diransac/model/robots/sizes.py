@@ -15,8 +15,6 @@ from xml.parsers import expat
 from diransac.errors import ModelError
 from diransac.limits import LARGEST_TABLE, MOST_CELLS, MOST_ELEMENTS, beyond, check_ordinary, read_bytes
 
-__all__ = ["check_description", "check_text"]
-
 
 def check_description(path: Path, label: str) -> None:
     """Raise ModelError where a description, or a file that it includes, is no ordinary file or describes too much.

@@ -10,8 +10,6 @@ from __future__ import annotations
 from diransac.simulation.compiler.machine_code import LANES, signature
 from diransac.simulation.compiler.vectors import INTEGER, INTEGERS, Value, Vectors, integer, new_function
 
-__all__ = ["emit_bisection"]
-
 
 def emit_bisection() -> Value:
     """LLVM module with one function, `order_statistics`.

@@ -22,8 +22,6 @@ from llvmlite import ir
 from diransac.simulation.compiler.machine_code import LANES, signature
 from diransac.simulation.compiler.vectors import DOUBLE, NUMBERS, Value, Vectors, integer, new_function
 
-__all__ = ["emit_block_elimination"]
-
 
 def emit_block_elimination() -> Value:
     """LLVM module with one function, `solve_blocks`.

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.vectors import Value
 
-__all__ = ["BlockSolution", "solve_blocks"]
-
 
 class BlockSolution(NamedTuple):
     """Solution of a block-tridiagonal system ``A``.

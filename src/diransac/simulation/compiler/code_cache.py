@@ -22,8 +22,6 @@ from diransac.atomic import write_bytes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["CodeCache", "hashed"]
-
 
 @dataclass(frozen=True)
 class CodeCache:

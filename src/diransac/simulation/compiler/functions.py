@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
 
 
-__all__ = ["Map", "PreparedMap", "PreparedScan", "Scan", "compile_map", "compile_scan"]
-
-
 class _Compiled:
     """An SX function, and its machine code by variant.  Raises ModelError: an operation cannot be compiled."""
 

@@ -19,8 +19,6 @@ from diransac.model.expressions import steps
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-__all__ = ["Graph", "Instruction", "check_compilable", "read_graph"]
-
 
 @dataclass(frozen=True, slots=True)
 class Instruction:

@@ -18,21 +18,6 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.machine_code import MachineCode
 
-
-__all__ = [
-    "ARGUMENTS",
-    "Lanes",
-    "aligned",
-    "arranged_feedback",
-    "arranged_lanes",
-    "arranged_measurements",
-    "arranged_weights",
-    "checked_array",
-    "run_time_loop",
-    "squared_thresholds",
-    "time_loop_arguments",
-]
-
 ARGUMENTS = {
     "parameters": "pointer",  # (n_p, n_padded) float64
     "initial_states": "pointer",  # (n_states, n_padded) float64

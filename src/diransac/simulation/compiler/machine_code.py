@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Sequence
     from concurrent.futures import ThreadPoolExecutor
 
-__all__ = ["LANES", "MachineCode", "Part", "Target", "compile_function", "default_threads", "run_blocks", "signature"]
-
 LANES = 8
 """Lanes of a vector, on every processor: results do not depend on the width of its registers."""
 

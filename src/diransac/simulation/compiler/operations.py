@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["OPERATIONS", "Operation", "emit_map_loop", "evaluate", "evaluate_into", "numbers"]
-
 
 @dataclass(frozen=True)
 class Operation:

@@ -13,8 +13,6 @@ from diransac.simulation.compiler.machine_code import LANES, MachineCode, compil
 if TYPE_CHECKING:
     from diransac.simulation.compiler.vectors import Value
 
-__all__ = ["order_statistics", "padded_rows"]
-
 
 def padded_rows(shape: tuple[int, ...]) -> FloatArray:
     """New array whose last axis holds whole vectors: that of the shape, not set, and infinity behind it.

@@ -14,16 +14,6 @@ from diransac.simulation.compiler.vectors import BYTE, DOUBLE, INTEGER, Value, i
 if TYPE_CHECKING:
     from diransac.simulation.compiler.time_loop import Block, LoopRow, TimeLoop
 
-__all__ = [
-    "ClosedLoopOutput",
-    "ErrorOutput",
-    "GaussNewtonOutput",
-    "LinearizedErrorOutput",
-    "Output",
-    "ScoreOutput",
-    "SignalOutput",
-]
-
 
 class Output:
     """Output of a variant of the loop; it emits its own code into the loop that it is made with."""

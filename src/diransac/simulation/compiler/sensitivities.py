@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.graph import Graph
     from diransac.simulation.compiler.vectors import Value, Vectors
 
-__all__ = ["ColumnGroup", "Columns", "DerivativeSpecification"]
-
 
 @dataclass(frozen=True)
 class ColumnGroup:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from diransac.simulation.compiler.graph import Graph
 
-__all__ = ["StageCalls", "StageFunction", "stage_module"]
-
 
 @dataclass(frozen=True)
 class StageFunction:

@@ -35,18 +35,6 @@ if TYPE_CHECKING:
     from diransac.simulation.compiler.sensitivities import DerivativeSpecification
     from diransac.simulation.compiler.stage_function import StageFunction
 
-__all__ = [
-    "Block",
-    "InputSource",
-    "LoopRow",
-    "LoopSpecification",
-    "TimeLoop",
-    "emit_time_loop",
-    "inputs_by_feedback",
-    "inputs_by_shared_feedback",
-    "inputs_from_log",
-]
-
 T = TypeVar("T")
 
 PARAMETER, STEP, RESULT = 2, 3, 4

@@ -18,8 +18,6 @@ from diransac.simulation.compiler.machine_code import LANES
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-__all__ = ["Loop", "Value", "Variable", "Vectors", "integer", "new_function"]
-
 Value: TypeAlias = Any
 """An LLVM value: a vector of numbers, of 64-bit integers or of conditions, or a scalar (llvmlite has no types)."""
 

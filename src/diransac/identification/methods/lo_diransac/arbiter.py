@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
 
-__all__ = ["Arbiter", "Comparison", "Scores", "horizons_of"]
-
 _SEGMENTS_PER_BLOCK = 20
 _SCALES = (0.125, 0.5, 2.0, 8.0)
 """Horizons over the time in which signals change by half of what they ever do."""

@@ -19,8 +19,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.simulation.compiler import solve_blocks
 
-__all__ = ["Arrowhead", "Factored"]
-
 # Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).
 _RIDGE = 1e-13
 

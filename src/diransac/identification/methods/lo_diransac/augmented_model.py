@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from diransac.model.derivation import Symbols
 
-__all__ = ["AugmentedModel", "augmented_model"]
-
 
 @dataclass(frozen=True)
 class AugmentedModel:

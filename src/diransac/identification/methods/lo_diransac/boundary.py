@@ -24,8 +24,6 @@ from diransac.arrays import FloatArray
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
 
-__all__ = ["BoundaryPrior"]
-
 # Part of the largest eigenvalue, of information that is scaled to a diagonal of one, that rounding leaves of none.
 _ROUNDING = 1e-14
 # Part of an unknown that the information must determine.

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["findings_of_fit"]
-
 
 def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:
     """Findings for and against an estimate.

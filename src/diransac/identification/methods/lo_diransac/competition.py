@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Contest", "compete", "is_settled"]
-
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4

@@ -13,8 +13,6 @@ from diransac.arrays import BoolArray, FloatArray
 if TYPE_CHECKING:
     pass
 
-__all__ = ["ErrorKind", "RecordingErrors"]
-
 
 @dataclass(frozen=True)
 class ErrorKind:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.mixture import Mixture
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["by_acceleration", "diagnosis_of"]
-
 _OUTLIER = 0.5
 
 

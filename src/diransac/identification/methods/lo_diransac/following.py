@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation.mujoco import MujocoRollouts
 
-__all__ = ["Pass", "Predictor"]
-
 _FIRST = 5
 """Samples of which the median is a first state."""
 _UNSURE = {"m": 0.05, "rad": 0.3, "1": 0.05}

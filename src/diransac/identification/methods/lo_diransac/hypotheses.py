@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.regression.estimators import BoundEstimator
 
-__all__ = ["WeakForm", "equation_scales", "find_hypotheses", "find_spikes", "random_sets", "robust_scores", "weak_form"]
-
 _OVERLAP = 5
 # Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
 _NUMBERS_AT_A_TIME = 1_000_000

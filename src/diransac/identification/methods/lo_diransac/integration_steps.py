@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["with_fewest_steps"]
-
 # Change of a parameter, standard errors, that adds half a per cent to its uncertainty.
 _NEGLIGIBLE = 0.1
 # Numbers of steps that are tried; one would need machine code of its own.

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["EffectOfIntervals", "batch_sums", "effect_of_intervals"]
-
 # Fewest batches of correlated intervals.
 _BATCHES = 4
 _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054

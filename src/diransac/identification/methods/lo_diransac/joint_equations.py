@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["JointEquations", "JointStep", "RecordingError", "Scores", "effect_on", "is_possible", "signal_rates"]
-
 # Part of the information of an error that other unknowns must leave; of an error of inputs, which moves the ends of
 # intervals that continuity holds, more than rounding.
 _DETERMINED, _ROUNDED = 1e-6, 1e-12

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["LATE", "Explanation", "LocalSearch", "fewest_parts"]
-
 LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 """Errors by which inputs act late."""
 

@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.parts import Change
     from diransac.identification.settings import Settings
 
-__all__ = ["LoDiransac", "configured"]
-
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
 _MANY_ROWS = 200_000

@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from diransac.identification.structure.candidate_terms import CandidateTerms
     from diransac.identification.structure.lacking_terms import Suggestion
 
-__all__ = ["Candidates", "MissingTerms", "candidates_of_fit", "missing_terms", "possible_terms"]
-
 # Part of the samples of an input that its size bounds.
 _MOSTLY = 0.99
 # Part of the variance of a parameter that a term must add to be kept.

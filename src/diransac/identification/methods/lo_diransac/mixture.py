@@ -15,9 +15,6 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.simulation.compiler import order_statistics, padded_rows
 
-__all__ = ["Mixture", "NoiseSums", "lower_scale"]
-
-
 # A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
 # standard normal variable.
 _BREAKDOWN, _OF_NORMAL = 0.35, 0.4538

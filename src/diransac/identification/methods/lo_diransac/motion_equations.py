@@ -20,18 +20,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation.compiler import Map
 
-__all__ = [
-    "discrepancy_units",
-    "equations_of_rows",
-    "inertia_of_motion",
-    "inertial_forces",
-    "means_of_intervals",
-    "parameter_units",
-    "residuals_of_motion",
-    "slopes_of_delays",
-    "unexplained",
-]
-
 _TINY = 1e-300
 
 

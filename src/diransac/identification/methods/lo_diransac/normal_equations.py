@@ -32,21 +32,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.mixture import Mixture
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = [
-    "Fit",
-    "NormalEquations",
-    "cost",
-    "data_gradient",
-    "innovation_std",
-    "innovations",
-    "linearize",
-    "of_logs",
-    "sum_in_places",
-    "variances_of_intervals",
-    "weights_of",
-    "with_residuals",
-]
-
 # A prior may alone determine a parameter, with less than the ridge's part of the precision of continuity.
 _FINE_RIDGE = 1e-15
 

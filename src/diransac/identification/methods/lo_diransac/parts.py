@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Change", "Parts", "compared_parts"]
-
 # A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious,
 # if held-out parts of the logs are predicted worse for it.
 _CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05

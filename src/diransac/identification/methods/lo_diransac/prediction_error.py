@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
 
-__all__ = ["Minimum", "minimised", "settled"]
-
 _PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 0.7, 0.05, 3
 """Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
 are halved."""

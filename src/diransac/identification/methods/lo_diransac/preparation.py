@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from diransac.data.segment import Segment
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 
-__all__ = ["cut", "prepared", "screened"]
-
 _FEWEST_INTERVALS = 4
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
 """Samples of running medians at most: spikes last for samples, however many of them there are in a second."""

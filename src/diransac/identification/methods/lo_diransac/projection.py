@@ -53,18 +53,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = [
-    "ProjectedEstimate",
-    "estimate_parameters",
-    "fitted_parameters",
-    "least_squares_gains",
-    "means_of_windows",
-    "projected_candidates",
-    "projected_parameters",
-    "with_parameters",
-]
-
-
 _TINY = 1e-300
 # Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0

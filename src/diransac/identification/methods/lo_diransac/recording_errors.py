@@ -26,15 +26,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = [
-    "LEAST_DELAY",
-    "clear_errors",
-    "errors_of",
-    "errors_of_inputs",
-    "errors_of_signals",
-    "with_errors",
-]
-
 LEAST_DELAY = 0.1
 """Delay, samples, from which on one is tried, and named."""
 

@@ -51,12 +51,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-__all__ = [
-    "Prior", "Refinement", "Step", "bounded", "diverges", "gauss_newton_step", "linearized", "make_prior", "refine",
-    "refine_exact", "start",
-]  # fmt: skip
-
-
 # Where tau starts, in spreads of the accelerations.
 _TAU_START = 0.3
 _SIGMA_FLOOR = 1e-5

@@ -23,16 +23,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = [
-    "SHRINK",
-    "ProcessSums",
-    "effect_on_state",
-    "most_probable_size",
-    "negligible_jumps",
-    "process_sums",
-    "unbroken_jumps",
-]
-
 SHRINK = 0.4
 """Largest change of any scale in a step."""
 

@@ -21,8 +21,6 @@ from diransac.arrays import FloatArray
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import NormalEquations
 
-__all__ = ["ScoreTests", "Slopes", "scores_tested"]
-
 _TINY = 1e-300
 
 

@@ -14,8 +14,6 @@ from diransac.data.filters import median_filter
 if TYPE_CHECKING:
     pass
 
-__all__ = ["odd_window", "running_median", "screened_inputs", "stuck_rows", "without_spikes"]
-
 # Samples that a window has at least.
 _FEWEST = 5
 # Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.

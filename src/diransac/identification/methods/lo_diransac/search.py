@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["Decided", "Searched", "likeliest", "rows_of_logs", "searched"]
-
 _ALL_OF_IT = 0.8
 """Fraction of a signal's spread from which on its noise leaves nothing to explain, and of its samples for outliers."""
 _MUCH = 0.1

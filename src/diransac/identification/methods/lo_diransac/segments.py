@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["DIVERGED", "ActingInputs", "Segments", "inlying_samples", "prior_states", "stretches"]
-
 DIVERGED = 1e50
 """Error after a divergence, and state from which on squares of its derivatives overflow, whatever their units."""
 _STATE_STEPS = 15

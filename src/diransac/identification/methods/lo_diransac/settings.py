@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from diransac.identification.structure.candidate_terms import TermLibrary
     from diransac.model import Model
 
-__all__ = ["LoDiransacSettings"]
-
-
 SOURCES = ("least squares", "simulation error", "second fit")
 """Sources of estimates besides the samples of the weak form and the joint fit that begins with them."""
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-__all__ = ["SHORTEST_LAG", "ShootingIntervals"]
-
 SHORTEST_LAG = 0.5
 """Time constant, samples, from which on an actuator's lag shows."""
 

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-__all__ = ["estimates_of_logs", "simulation_error_candidates"]
-
 _SHORTEST, _GROWTH = 8, 3
 """Rows of the shortest segments at least, and the factor by which they grow, up to the length of a block."""
 _N_RANDOM, _DECADES = 16, 1.0

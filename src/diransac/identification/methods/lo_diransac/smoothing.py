@@ -30,14 +30,6 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from diransac.model import Model
 
-__all__ = [
-    "Motion",
-    "Samples",
-    "choose_half_widths",
-    "smooth",
-    "split_signals",
-]
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 _DEGREE, _STEPS = 4, 12

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.model import Model, Parameter
 
-__all__ = ["Blocks", "Candidate", "jackknife", "least_squares_candidates"]
-
 N_BLOCKS = 10
 """Number of blocks, of which each is left out in turn."""
 _KEPT = 0.5

@@ -37,8 +37,6 @@ from diransac.identification.methods.lo_diransac.interval_effects import batch_s
 if TYPE_CHECKING:
     from diransac.identification.structure.candidate_terms import CandidateTerm
 
-__all__ = ["CandidateTests", "MeanForces", "TermRegression", "select_terms", "weighted"]
-
 # Prior: RMS force of a term over the largest force of its equation; odds of the terms of a kind and place, together.
 _RELATIVE, _ODDS = 0.1, 1.0
 # Logarithm of the odds of a suggested term, after the choice among all candidates: strong evidence (Kass, Raftery).

@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 
-__all__ = [
-    "measured_signals", "unmeasured_by_name", "unmeasured_states", "with_observed_states", "with_unmeasured_states",
-]  # fmt: skip
-
 # Steps from all starts; the number of those that go on, and their further steps.
 _N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 15, 12, 60
 # Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out.

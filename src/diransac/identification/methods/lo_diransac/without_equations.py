@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-__all__ = ["Followed", "estimated_by_simulation", "followed"]
-
 _SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
 """Samples of an interval; intervals of the logs at least."""
 _NOTHING_KNOWN, _SMALL = 1.0, 0.01
