@@ -85,7 +85,6 @@ def _parts() -> dict[str, Part]:
         "unmodelled accelerations": Part(replace(DEFAULT, model_error=False)),
         "input gain and bias discrepancy": Part(replace(DEFAULT, prior_discrepancy=1e-6, initial_discrepancy=1e-6)),
         "finer intervals": Part(patches=(("local_search.fewest_parts", lambda _: 0),)),
-        "second start of the exact model": Part(patches=(("local_search._APART", np.inf),)),
         "errors of recordings": Part(replace(DEFAULT, **off)),
         "errors must explain forces": Part(
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))

@@ -53,8 +53,6 @@ LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 _AS_LIKELY = 5.0
 # Shortest interval, samples.
 _SHORTEST = 3
-# Relative difference of parameters that makes a second start.
-_APART = 0.2
 # Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 # Delays, samples, of held inputs that vary between samples.
@@ -149,15 +147,15 @@ class LocalSearch:
     settings : LoDiransacSettings
     motion : Motion
         Smoothed motion over the rows of the intervals.
-    hypotheses : (n, n_p) array
-        Best first.
+    hypothesis : (n_p,) array
+        The best one.
     prior : Prior
     callback : callable or None
     """
 
     settings: LoDiransacSettings
     motion: Motion
-    hypotheses: FloatArray
+    hypothesis: FloatArray
     prior: Prior
     callback: Callback | None
 
@@ -342,7 +340,7 @@ class LocalSearch:
     def _from_hypothesis(self, intervals: ShootingIntervals) -> Explanation:
         """Local optimisation from the best hypothesis, with unmodelled accelerations."""
         report(self.callback, "local optimisation", 0.1)
-        begin = start(self.settings, intervals, self.motion, self.hypotheses[0], self.prior)
+        begin = start(self.settings, intervals, self.motion, self.hypothesis, self.prior)
         return Explanation(refine(self.settings, intervals, begin, self.prior), exact=False)
 
     def _accurate(self, found: Explanation) -> Explanation:
@@ -376,30 +374,19 @@ class LocalSearch:
         return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
 
     def _likeliest_exact(self, flexible: Explanation) -> Explanation | None:
-        """The exact model from the parameters of a fit, or the best hypothesis; None if both are impossible.
+        """The exact model from the parameters of a fit; None if these are impossible.
 
         One that is less likely may be so for a delay of all inputs, for which unmodelled accelerations stand.
         """
-        intervals, fit = flexible.intervals, flexible.refinement.fit
-        projected, found, late = flexible.projected, list[Explanation](), intervals.all_inputs("delay")
-        starts = np.array([projected, self.hypotheses[0]])
-        starts = starts[: 1 + bool((np.abs(starts[1] - starts[0]) > _APART * np.abs(starts[0])).any())]
-        for p in starts[intervals.layout.admits(starts)]:
-            shared = np.concatenate([p, fit.shared[intervals.n_p :]])
-            exact = self._exact(intervals, replace(fit, shared=shared), flexible.cost)
-            if exact is None:
-                continue
-            found.append(exact)
-            if (
-                exact.cost > flexible.cost
-                and late not in exact.intervals.all_errors.kinds
-                and late in self._sought(exact)
-            ):
-                also = self._exact(intervals.with_errors([late]), replace(fit, shared=shared), flexible.cost)
-                found += [also] if also is not None else []
-            if found[-1].cost < flexible.cost:
-                break
-        return min(found, key=lambda x: x.cost, default=None)
+        intervals, fit, late = flexible.intervals, flexible.refinement.fit, flexible.intervals.all_inputs("delay")
+        if not intervals.layout.admits(flexible.projected[None])[0]:
+            return None
+        begin = replace(fit, shared=np.concatenate([flexible.projected, fit.shared[intervals.n_p :]]))
+        exact = self._exact(intervals, begin, flexible.cost)
+        if exact is None or exact.cost <= flexible.cost or late in exact.intervals.all_errors.kinds:
+            return exact
+        also = self._exact(intervals.with_errors([late]), begin, flexible.cost) if late in self._sought(exact) else None
+        return exact if also is None else min(exact, also, key=lambda x: x.cost)
 
     def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: float) -> Explanation | None:
         """The exact model from a motion, with all integration steps: it is one simulation of the whole log.

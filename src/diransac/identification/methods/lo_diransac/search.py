@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import dropwhile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -211,13 +210,13 @@ def searched(
     if n_spikes:
         notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, hypotheses[0]))
-    able = list(dropwhile(lambda p: diverges(start(settings, intervals, motion, p, prior)), hypotheses))
-    if not able:
+    able = next((p for p in hypotheses if not diverges(start(settings, intervals, motion, p, prior))), None)
+    if able is None:
         raise IdentificationError(
             f"{dataset.source}: simulations of {intervals.length} rows from smoothed states diverge, with each of "
             f"{len(hypotheses)} samples of the parameters; compare the model with the machine, or bound them"
         )
-    search = LocalSearch(settings, motion, np.array(able), prior, callback)
+    search = LocalSearch(settings, motion, able, prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
     return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
