@@ -23,6 +23,7 @@ from diransac.identification.assessment.inspection import inspect
 from diransac.studio.project import Project
 
 pytest.importorskip("starlette", reason="STUDIO NOT CHECKED: pip install 'diransac[studio]'")
+from diransac.studio import hosts_of
 from diransac.studio.folders import Folders
 from diransac.studio.scene import _content
 from diransac.studio.series import Logs
@@ -214,6 +215,19 @@ def test_folders_are_those_that_were_given(tmp_path):
         folders.find("../y.csv")
     with pytest.raises(dr.LogError, match="does not exist"):
         Folders([tmp_path / "absent"])
+    nested = Folders([tmp_path, tmp_path / "a"]).listed()["logs"]
+    assert [x["name"] for x in nested] == ["y.csv", "a/x.csv"]
+
+
+def test_a_browser_leaves_the_usual_port_out():
+    assert hosts_of(8000) == ["127.0.0.1:8000", "localhost:8000"]
+    assert "localhost" in hosts_of(80)
+
+
+def test_names_that_the_command_line_would_take_for_others_are_refused():
+    project = Project.of({"logs": ["a.csv"], "map": {"x": "pos,x"}}, "test")
+    with pytest.raises(dr.SettingsError, match="comma"):
+        project.words()
 
 
 # ---------------------------------------------------------------------- views

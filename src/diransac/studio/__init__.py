@@ -46,7 +46,7 @@ def serve(given: Sequence[Path], port: int, tell: Callable[[str], None]) -> None
     port = listening.getsockname()[1]
     token = secrets.token_urlsafe(24)
     studio = Studio(Folders(given))
-    app = Guard(application(studio), token, [f"{name}:{port}" for name in (_LOOPBACK, "localhost")])
+    app = Guard(application(studio), token, hosts_of(port))
     config = uvicorn.Config(
         app, log_level="critical", access_log=False, ws="none", server_header=False, timeout_graceful_shutdown=1
     )
@@ -78,3 +78,9 @@ def _listening(port: int) -> socket.socket:
         found.close()
         raise SettingsError(f"port {port} of this machine is not free; give another one: --port 0") from error
     return found
+
+
+def hosts_of(port: int) -> list[str]:
+    """Names by which a browser asks for this server, which leaves HTTP's own port out."""
+    names = [_LOOPBACK, "localhost"]
+    return [f"{name}:{port}" for name in names] + (names if port == 80 else [])

@@ -121,6 +121,8 @@ class Folders:
     def _walked(self) -> Iterator[tuple[Path, bool]]:
         """Files that may be logs or models; a folder with a bag is a log."""
         for root in self.roots:
+            if any(root != other and root.is_relative_to(other) for other in self.roots):
+                continue  # what is in it is in the other
             for place, folders, files in os.walk(root):
                 folder = Path(place)
                 if "metadata.yaml" in files and folder != root:
