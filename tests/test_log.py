@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from hypothesis import example as tried
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -281,6 +282,7 @@ names = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min
 )
 
 
+@tried(ending=".parquet", signals={"*": [0.0, 1.0, 2.0], "^.*$": [3.0, 4.0, 5.0]}, start=0.0)
 @given(
     ending=st.sampled_from(ENDINGS),
     signals=st.dictionaries(names, st.lists(any_float, min_size=3, max_size=3), min_size=1, max_size=4),

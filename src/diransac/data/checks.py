@@ -55,8 +55,10 @@ def numeric_columns(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[dict[str, 
 
 
 def as_column(values: npt.ArrayLike, name: str, source: str) -> FloatArray:
-    """Read-only copy ``(N,)``.  Raises LogError: the values are not one column of real numbers."""
+    """Read-only copy ``(N,)``, or such a copy itself.  Raises LogError: they are not one column of real numbers."""
     array = np.asarray(values)
+    if array.dtype == np.float64 and array.ndim == 1 and array.flags.owndata and not array.flags.writeable:
+        return array
     numbers = as_numbers(array)
     if isinstance(numbers, str):
         raise LogError(f'{source}: signal "{name}" {numbers}')
@@ -196,9 +198,10 @@ def check_even(time: FloatArray, source: str) -> None:
     Every row is taken to last ``dt``, so that single intervals matter, and the drift of the clock does not.
     """
     steps = np.diff(time)
-    dt, usual = float(np.mean(steps)), float(np.median(steps))
-    if np.abs(steps - dt).max() <= (0.2 + _ROUNDING) * dt:
+    dt = float(np.mean(steps))
+    if max(float(steps.max()) - dt, dt - float(steps.min())) <= (0.2 + _ROUNDING) * dt:
         return
+    usual = float(np.median(steps))
     row, gaps = int(np.argmax(np.abs(steps - usual))), steps > 1.5 * usual
     n_gaps = int(gaps.sum())
     what = f"{n_gaps} gap{'s' * (n_gaps > 1)}, the longest" if gaps[row] else "the most uneven interval"

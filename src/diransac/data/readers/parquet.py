@@ -29,14 +29,15 @@ def read_parquet(data: bytes, source: str) -> Table:
     Raises LogError: the data are no Parquet file, are cut off, or are damaged.
     """
     import polars as pl
+    from polars.selectors import by_name  # of which "*" and "^...$" are names as others
 
     with scanned(data, source) as (lazy, schema):
         numeric = [name for name, kind in schema.items() if is_numeric(kind)]
-        frame = pl.read_parquet(io.BytesIO(data), columns=numeric)
+        frame = lazy.select(by_name(*numeric)).collect()
         # Texts and lists may be of any size: only few rows of columns without numbers are looked at.
-        few = lazy.drop(numeric).head(1000).collect() if len(numeric) < len(schema) else frame.clear()
+        few = lazy.drop(by_name(*numeric)).head(1000).collect() if len(numeric) < len(schema) else frame.clear()
         dated = [name for name, kind in schema.items() if kind in (pl.Datetime, pl.Duration)]
-        times = {name: _seconds(series) for name, series in lazy.select(dated).collect().to_dict().items()}
+        times = {name: _seconds(series) for name, series in lazy.select(by_name(*dated)).collect().to_dict().items()}
         metadata = pl.read_parquet_metadata(io.BytesIO(data)).get(KEY)
     named = [split_unit(header) for header in schema]
     check_unique([name for name, _ in named], source)
