@@ -22,7 +22,7 @@ class Signals:
     """
 
     has_equations = True
-    """Whether the residuals are known as expressions; otherwise a simulator alone knows the machine."""
+    """True where the residuals are known as expressions; otherwise a simulator alone knows the machine."""
     kinematics: ca.Function | None
 
     def _name_signals(

@@ -61,7 +61,7 @@ class Studio:
         self._solved: dict[str, Any] | None = None
 
     def _solvable(self) -> dict[str, Any]:
-        """What a solution depends on."""
+        """Options that a solution depends on."""
         return {key: value for key, value in self.project.options.items() if key != "held-out"}
 
     def changed(self) -> None:
@@ -80,7 +80,7 @@ class Studio:
         return True
 
     def state(self) -> dict[str, Any]:
-        """What every tab shows."""
+        """State that every tab shows."""
         code = self.code()
         return {
             "version": self.version,

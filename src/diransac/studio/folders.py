@@ -99,7 +99,7 @@ class Folders:
         return path
 
     def _holds(self, real: Path) -> bool:
-        """Whether a path without links is below the folders."""
+        """True for a path without links below the folders."""
         return any(real.is_relative_to(root) for root in self.roots)
 
     def name_of(self, path: Path) -> str:

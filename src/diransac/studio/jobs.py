@@ -51,7 +51,7 @@ class Job:
     process: asyncio.subprocess.Process | None = None
 
     def state(self) -> dict[str, Any]:
-        """What a page shows while it runs."""
+        """State that a page shows while it runs."""
         running = self.status == "running"
         return {
             "number": self.number,

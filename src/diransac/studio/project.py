@@ -112,7 +112,7 @@ class Project(BaseModel):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What is given, by the names of the command line."""
+        """Options that are given, by the names of the command line."""
         return self.model_dump(by_alias=True, exclude_defaults=True)
 
     def changed(self, changes: Mapping[str, Any]) -> Self:
@@ -264,7 +264,7 @@ def _placed(model: str, folder: Path) -> str:
 
 
 def _is_name(text: str) -> bool:
-    """Whether Python takes a text as a name."""
+    """True for a text that Python takes as a name."""
     return text.isidentifier() and not keyword.iskeyword(text)
 
 

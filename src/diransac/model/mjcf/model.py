@@ -249,7 +249,7 @@ class MujocoModel(Model):
         return self.state if tuple(signals) else ()
 
     def equations_text(self) -> tuple[str, ...]:
-        """What stands for equations in a report."""
+        """Lines in place of equations in a report."""
         return (f"simulated by MuJoCo: {self.compiled.nbody - 1} bodies, {self.n_v} degrees of freedom",)
 
     # ------------------------------------------------------------------ other models of the same machine

@@ -255,7 +255,7 @@ class Predictor:
 
 @dataclass(frozen=True)
 class _Belief:
-    """What is known of a state: its covariance, and the change of its mean with the parameters."""
+    """Covariance of a state, and the change of its mean with the parameters."""
 
     covariance: FloatArray
     slopes: FloatArray

@@ -169,7 +169,7 @@ def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[Shooting
 
 @dataclass(frozen=True)
 class _Found:
-    """What passes over the logs have found."""
+    """Outcome of passes over the logs."""
 
     settings: LoDiransacSettings
     dataset: Dataset
