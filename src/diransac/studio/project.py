@@ -241,9 +241,8 @@ def _texts(key: str, value: Any) -> list[str]:
 
 def _pair(key: str, name: str, value: Any) -> str:
     """A name and its value as the command line takes them.  Raises SettingsError: it would take them for others."""
-    for text in (name, value) if isinstance(value, str) else (name,):
-        if "," in text or "=" in text:
-            raise SettingsError(f"{key}: {text!r:.100} has a comma or an equals sign; rename it in the file")
+    if "," in name or "=" in name or (key == "map" and "," in value):
+        raise SettingsError(f"{key}: {name!r:.100} has a comma or an equals sign, or its column a comma; rename it")
     if key == "prior":
         return f"{name}={value[0]!r},{value[1]!r}"
     if key == "settings" and isinstance(value, bool):
