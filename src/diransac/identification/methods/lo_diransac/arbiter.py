@@ -217,6 +217,11 @@ class Arbiter:
         return np.asarray(known & _predicted(one))
 
     @cached_property
+    def _counts(self) -> list[IntArray]:
+        """Numbers ``(K, n_s)`` of these samples, by horizon."""
+        return [self._known[:, :n].sum(axis=1) for n in self.steps]
+
+    @cached_property
     def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
         """Spread ``(n_s,)`` of the signals, and RMS errors of the prediction that nothing changes, by horizon."""
         one, n_before = self.segments, self.n_before
@@ -235,11 +240,10 @@ class Arbiter:
         The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
         """
         spread, no_change = self._sizes
-        errors, losses, found = self._errors(candidate), list[FloatArray](), list[FloatArray]()
-        for n, size in zip(self.steps, no_change, strict=True):
-            e, known = errors[:, :n], self._known[:, :n]
-            count = known.sum(axis=1)
-            mse = np.where(known, np.square(e), 0.0).sum(axis=1) / np.maximum(count, 1)
+        losses, found = list[FloatArray](), list[FloatArray]()
+        squares = np.where(self._known, np.square(self._errors(candidate)), 0.0)
+        for n, count, size in zip(self.steps, self._counts, no_change, strict=True):
+            mse = squares[:, :n].sum(axis=1) / np.maximum(count, 1)
             mse = np.where(count > 0, mse, np.nan)
             losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
             found.append(_medians(mse / np.square(size)))
@@ -270,7 +274,9 @@ def _means(values: FloatArray) -> FloatArray:
 def _medians(values: FloatArray) -> FloatArray:
     """Medians ``(n,)`` of the finite numbers of each column; NaN where there are none."""
     known = np.isfinite(values)
-    return np.array([np.median(x[k]) if k.any() else np.nan for x, k in zip(values.T, known.T, strict=True)])
+    ordered, count = np.sort(np.where(known, values, np.nan), axis=0), known.sum(axis=0)
+    middle = (ordered[np.maximum(k, 0), np.arange(len(count))] for k in ((count - 1) // 2, count // 2))
+    return np.where(count > 0, 0.5 * sum(middle), np.nan)
 
 
 def _predicted(segments: Segments) -> BoolArray:

@@ -171,6 +171,19 @@ def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -
     return replace(chosen, motion=contest.motion, result=result, decided=decided, impossible=impossible)
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """A candidate, the fit or the motion that it came from, and its scores once it has been compared."""
+
+    candidate: Candidate
+    origin: Motion | Explanation
+    scores: Scores | None = None
+
+    def scored(self, arbiter: Arbiter) -> _Entry:
+        """The entry with its scores."""
+        return self if self.scores is not None else replace(self, scores=arbiter.scores(self.candidate))
+
+
 @dataclass
 class Contest:
     """Candidates of one dataset, and their comparison.
@@ -196,20 +209,32 @@ class Contest:
 
     def __post_init__(self) -> None:
         self.blocks = Blocks.of(self.intervals)
-        self.candidates: list[Candidate] = []
-        self.origins: list[Motion | Explanation] = []
+        self.entries: list[_Entry] = []
+        self.judge: Searched | None = None
         self.arbiter: Arbiter | None = None
-        self.scores: list[Scores] = []
         self.comparison: Comparison | None = None
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """In the order in which they are preferred where they predict as well."""
+        return [x.candidate for x in self.entries]
+
+    @property
+    def origins(self) -> list[Motion | Explanation]:
+        """The fit or the motion that each came from."""
+        return [x.origin for x in self.entries]
+
+    @property
+    def scores(self) -> list[Scores]:
+        """Of all candidates that have been compared."""
+        return [x.scores for x in self.entries if x.scores is not None]
 
     def add_fit(self, found: Searched, origin: str = "") -> None:
         """Add the estimates of a joint fit, before those that are there, but after those of a likelier one."""
         acting = self._acting(found)
-        some = list(
-            _estimates_of_fit(found.likeliest, acting, self.blocks, origin, projection=self.settings.projection)
-        )
+        some = _estimates_of_fit(found.likeliest, acting, self.blocks, origin, projection=self.settings.projection)
         k = sum(not isinstance(x, Motion) and x.cost < found.likeliest.cost for x in self.origins)
-        self.candidates[k:k], self.origins[k:k] = some, [found.likeliest] * len(some)
+        self.entries[k:k] = [_Entry(x, found.likeliest) for x in some]
 
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
@@ -230,18 +255,15 @@ class Contest:
             actings = [own] if self.settings.forces_timing else [*actings, own] if own.differs(actings) else actings
         if "least squares" in sources and not self.settings.forces_timing:
             report(self.callback, "least squares", 0.88)
-            for one in least_squares_candidates(dataset, self.intervals, self.blocks):
-                self.candidates.append(one)
-                self.origins.append(self.motion)
+            found = least_squares_candidates(dataset, self.intervals, self.blocks)
+            self.entries += [_Entry(x, self.motion) for x in found]
         if "simulation error" in sources:
             report(self.callback, "simulation error", 0.885)
-            found = simulation_error_candidates(
+            simulated = simulation_error_candidates(
                 intervals, self.motion, self._starts(first), actings, self.seed, self.blocks,
                 outliers=self.settings.outliers,
             )  # fmt: skip
-            for one, motion in found:
-                self.candidates.append(one)
-                self.origins.append(motion)
+            self.entries += [_Entry(x, motion) for x, motion in simulated]
 
     def _starts(self, first: Searched | None) -> FloatArray:
         """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
@@ -255,24 +277,26 @@ class Contest:
     def decide(self, search: Searched | None) -> int | None:
         """Index of the winner; None where the logs are too short to be compared, or nothing takes part.
 
-        Outliers and noise are those of a search.
+        Outliers and noise are those of a search; another one than before scores all candidates again.
         """
-        if not self.candidates:
+        if not self.entries:
             return None
         report(self.callback, "comparing predictions", 0.89)
-        inlying, noise = self._noise_of(search)
-        acting, horizon = self.candidates[0].acting, self.settings.horizon
-        self.arbiter = Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
+        if self.arbiter is None or search is not self.judge:
+            self.judge, self.arbiter = search, self._judged_by(search)
+            self.entries = [replace(x, scores=None) for x in self.entries]
         if self.arbiter is None:
             return None
-        self.scores = [self.arbiter.scores(x) for x in self.candidates]
-        if not any(np.isfinite(x.losses).any() for x in self.scores):
+        self.entries = [x.scored(self.arbiter) for x in self.entries]
+        scores = self.scores
+        if not any(np.isfinite(x.losses).any() for x in scores):
             return None
-        self.comparison = Comparison.of(self.scores, self._timed)
+        self.comparison = Comparison.of(scores, self._timed)
         best = self.comparison.best
-        errors = ", ".join(f"{x:.2g}" for x in self.scores[best].errors)
-        best_so_far = f"best so far: {self.candidates[best].name}, held-out errors {errors} of those of no change"
-        parameters = dict(zip(self.dataset.layout.names, self.candidates[best].parameters.tolist(), strict=True))
+        winner = self.entries[best].candidate
+        errors = ", ".join(f"{x:.2g}" for x in scores[best].errors)
+        best_so_far = f"best so far: {winner.name}, held-out errors {errors} of those of no change"
+        parameters = dict(zip(self.dataset.layout.names, winner.parameters.tolist(), strict=True))
         report(self.callback, "comparing predictions", 0.89, best_so_far, parameters=parameters)
         return best
 
@@ -281,6 +305,12 @@ class Contest:
         """Mask of the candidates whose inputs act at another time than was recorded, unasked."""
         forced = self.settings.forces_timing
         return np.array([not forced and x.acting.timing != InputTiming() for x in self.candidates])
+
+    def _judged_by(self, search: Searched | None) -> Arbiter | None:
+        """The arbiter with the outliers and the noise of a search."""
+        inlying, noise = self._noise_of(search)
+        acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
+        return Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
 
     def _noise_of(self, search: Searched | None) -> tuple[BoolArray, FloatArray]:
         """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
