@@ -141,14 +141,21 @@ def _delayed(recorded: FloatArray, delay: float) -> FloatArray:
     return later if delay == whole else np.asarray(later + (delay - whole) * (earlier - later))
 
 
+def _decaying(x: FloatArray, decay: float) -> FloatArray:
+    """Solution ``(N,)`` of ``y[k] = x[k] + decay * y[k - 1]`` by doubling: after k sums, each has 2^k terms."""
+    y, power, n = x.copy(), decay, 1
+    while n < len(y) and power > 1e-18:
+        y[n:] += power * y[:-n]
+        power, n = power**2, 2 * n
+    return y
+
+
 def _lagging(u: FloatArray, lag: float, hold: str) -> FloatArray:
     """Response ``(N,)`` of an actuator with a time constant in samples, as it acts in a simulation."""
     if not lag:
         return u
-    from scipy.signal import lfilter
-
     decay = np.exp(-1.0 / lag)
-    at_rows = lfilter([0.0, 1.0 - decay], [1.0, -decay], u, zi=u[:1])[0]
+    at_rows = _decaying(np.concatenate([u[:1], (1.0 - decay) * u[:-1]]), float(decay))
     means: FloatArray = u + (at_rows - u) * lag * (1.0 - decay)
     if hold == "zero-order":
         return means

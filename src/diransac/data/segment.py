@@ -174,12 +174,14 @@ class Segment:
 
     def _line(self, name: str, n_rows: int) -> tuple[float, float]:
         """Value and slope at row 0 of the line through a signal's first samples, by Theil and Sen."""
-        from scipy.stats import theilslopes
-
         column = self.column(name)
         rows = np.flatnonzero(np.isfinite(column))[:n_rows]
-        slope, intercept, *_ = theilslopes(column[rows], rows * self.log.dt)
-        return float(intercept), float(slope)
+        y, t = column[rows], rows * self.log.dt
+        if len(rows) < 2:
+            return float(y[0]), 0.0
+        i, j = np.triu_indices(len(rows), 1)
+        slope = float(np.median((y[j] - y[i]) / (t[j] - t[i])))
+        return float(np.median(y) - slope * np.median(t)), slope
 
     def with_signals(self, signals: tuple[str, ...]) -> Segment:
         """The segment with exactly these signals, NaN where its log has none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,6 +43,11 @@ class Competitor:
     parameters: Values
 
 
+def predicts(errors: Sequence[float] | FloatArray) -> bool:
+    """True for errors, over that of the prediction that nothing changes, of which one is much smaller than that."""
+    return bool(np.min(errors) < 0.5)
+
+
 def _error(error: float) -> str:
     """An error in a table; that of a simulation that diverges is no number."""
     return f"{error:.2g}" if np.isfinite(error) else "diverges"
@@ -69,7 +74,7 @@ class Competition:
     @property
     def predicts(self) -> bool:
         """True if the winner predicts much better than that nothing changes, at one horizon at least."""
-        return min(next(x for x in self.competitors if x.name == self.winner).errors) < 0.5
+        return predicts(next(x for x in self.competitors if x.name == self.winner).errors)
 
     def lines(self) -> list[list[str]]:
         """Rows of a table: the best variant of each source, its errors at each horizon, and whether it is as good."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -41,83 +41,56 @@ _LONG = 400
 
 
 # Inputs between rows -------------------------------------------------------------------------------------------------
-class Hold(Protocol):
-    """Inputs from one row to the next, as the time loop reads and the integration steps evaluate them."""
+HOLDS = ("zero-order", "linear", "smooth")
+"""Inputs from a row to the next: held, interpolated linearly (first-order hold), or by a parabola; the last are held.
 
-    def columns(self, inputs: FloatArray, substeps: int, first_rows: IntArray) -> FloatArray:
-        """Columns of each row (n_log, n_columns) from its inputs (n_log, n_u), and the first row of each log."""
-
-    def n_changes(self, n_u: int) -> int:
-        """Number of trailing columns, differences by which the columns before them change with each sub-step."""
-
-    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
-        """Inputs (n_u,) after a fraction of a sub-step, from the columns at its beginning."""
+The curvature of the parabola is the mean of the second differences at both rows, so that its mean is that of the cubic
+polynomial through four rows.
+"""
 
 
-class _ZeroOrderHold:
-    """Inputs of a row until the next."""
+def input_columns(hold: str, inputs: FloatArray, substeps: int, first_rows: IntArray) -> FloatArray:
+    """Columns of each row, as the time loop reads them.
 
-    def columns(self, inputs: FloatArray, _substeps: int, _first_rows: IntArray) -> FloatArray:
-        """The inputs."""
-        return inputs
+    Parameters
+    ----------
+    hold : str
+        One of `HOLDS`.
+    inputs : (n_log, n_u) array
+    substeps : int
+    first_rows : (n,) int array
+        First row of each log.
 
-    def n_changes(self, _n_u: int) -> int:
-        """No column changes."""
-        return 0
-
-    def at(self, columns: ca.SX, _fraction: float) -> ca.SX:
-        """The inputs."""
-        return columns
-
-
-class _LinearHold:
-    """Linear interpolation between the inputs of a row and of the next; those of the last row are held."""
-
-    def columns(self, inputs: FloatArray, substeps: int, _first_rows: IntArray) -> FloatArray:
-        """The inputs, then their changes in a sub-step."""
-        return np.hstack([inputs, np.diff(inputs, axis=0, append=inputs[-1:]) / substeps])
-
-    def n_changes(self, n_u: int) -> int:
-        """Every input changes."""
-        return n_u
-
-    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
-        """Inputs at the beginning, and the fraction of their change."""
-        n_u = columns.numel() // 2
-        return columns[:n_u] + fraction * columns[n_u:]
-
-
-class _SmoothHold:
-    """A parabola from the inputs of a row to those of the next; those of the last row are held.
-
-    Its curvature is the mean of the second differences at both rows, so that its mean is that of the cubic polynomial
-    through four rows.
+    Returns
+    -------
+    (n_log, n_u) or (n_log, 3 n_u) array
+        The inputs; where these vary, then their first and second differences from sub-step to sub-step.
     """
-
-    def columns(self, inputs: FloatArray, substeps: int, first_rows: IntArray) -> FloatArray:
-        """The inputs, then their first and second differences from sub-step to sub-step."""
-        curvature = np.zeros_like(inputs)
+    if hold == "zero-order":
+        return inputs
+    first, second = np.diff(inputs, axis=0, append=inputs[-1:]) / substeps, np.zeros_like(inputs)
+    if hold == "smooth":
         for log in np.split(np.arange(len(inputs)), first_rows[first_rows > 0]):
             if len(log) > 2:
                 bends = np.pad(np.diff(inputs[log], 2, axis=0), ((1, 1), (0, 0)), mode="edge")
-                curvature[log[:-1]] = 0.5 * (bends[:-1] + bends[1:])
-        change = np.diff(inputs, axis=0, append=inputs[-1:])
-        first = change / substeps - (substeps - 1) / (2 * substeps**2) * curvature
-        return np.hstack([inputs, first, curvature / substeps**2])
-
-    def n_changes(self, n_u: int) -> int:
-        """Every input changes, and its change does."""
-        return 2 * n_u
-
-    def at(self, columns: ca.SX, fraction: float) -> ca.SX:
-        """Newton's interpolation."""
-        n_u = columns.numel() // 3
-        u, first, second = columns[:n_u], columns[n_u : 2 * n_u], columns[2 * n_u :]
-        return u + fraction * first + 0.5 * fraction * (fraction - 1.0) * second
+                second[log[:-1]] = 0.5 * (bends[:-1] + bends[1:])
+        first -= (substeps - 1) / (2 * substeps**2) * second
+        second /= substeps**2
+    return np.hstack([inputs, first, second])
 
 
-HOLDS: dict[str, Hold] = {"zero-order": _ZeroOrderHold(), "linear": _LinearHold(), "smooth": _SmoothHold()}
-"""Inputs between rows: held, interpolated linearly (first-order hold), or by parabolas."""
+def interpolated(u: Any, first: Any, second: Any, fraction: Any) -> Any:
+    """Inputs after a fraction of a sub-step, from their differences at its beginning (Newton's interpolation)."""
+    return u + fraction * first + 0.5 * fraction * (fraction - 1.0) * second
+
+
+def _inputs_at(columns: ca.SX, n_u: int, fraction: float) -> ca.SX:
+    """Inputs ``(n_u,)`` after a fraction of a sub-step, from the columns at its beginning."""
+    if columns.numel() == n_u:
+        return columns
+    u, first, second = ca.vertsplit(columns, n_u)
+    found: ca.SX = interpolated(u, first, second, fraction)
+    return found
 
 
 # Integrators ---------------------------------------------------------------------------------------------------------
@@ -217,9 +190,9 @@ def loop_specification(
     model: SimulatedModel,
     signals: Sequence[str],
     integrator: str,
-    hold: str,
     sensitivities: Sensitivities | None = None,
     *,
+    varying: bool,
     divided: bool,
 ) -> LoopSpecification:
     """Expressions of one row, as graphs.
@@ -232,16 +205,16 @@ def loop_specification(
         Signals that are compared with measurements.
     integrator : str
         One of `INTEGRATORS`.
-    hold : str
-        One of `HOLDS`.
     sensitivities : Sensitivities, optional
         The derivatives to simulate.
+    varying : bool
+        Whether inputs may vary between rows.
     divided : bool
         Whether there may be several integration steps from one row to the next.
     """
     from diransac.simulation.compiler.time_loop import PARAMETER, STEP, LoopSpecification
 
-    n_changes = HOLDS[hold].n_changes(model.n_u)
+    n_changes = 2 * model.n_u if varying else 0
     sizes = {"x": len(model.state), "u": model.n_u + n_changes, "p": model.n_p, "h": 1}
     arguments = [ca.SX.sym(name, n) for name, n in sizes.items()]
     scored = tuple(model.signals.index(name) for name in signals)
@@ -255,7 +228,7 @@ def loop_specification(
         results.append(ca.SX.sym("r", len(model.state) + model.n_v))
         return results[-1][: len(model.state)], results[-1][len(model.state) :]
 
-    after, simulated, points = _expressions(model, called if dynamics else inlined, integrator, HOLDS[hold], arguments)
+    after, simulated, points = _expressions(model, called if dynamics else inlined, integrator, arguments)
     derivatives = _derivatives(model, integrator, scored, sensitivities, points[0].size2()) if sensitivities else None
     outputs = [after, simulated, *(points if sensitivities or dynamics else ())]
     step = ca.Function("step", [*arguments, ca.vertcat(*results)], outputs)
@@ -292,7 +265,6 @@ def _expressions(
     model: SimulatedModel,
     dynamics: Callable[[ca.SX, ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
     integrator: str,
-    hold: Hold,
     arguments: Sequence[ca.SX],
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX, ca.SX]]:
     """State after a step, all signals before it, and the points of the step, from dynamics (x, u, p) -> (dx/dt, a).
@@ -305,7 +277,7 @@ def _expressions(
 
     def rates(state: ca.SX, fraction: float) -> ca.SX:
         states.append(state)
-        held.append(hold.at(inputs, fraction))
+        held.append(_inputs_at(inputs, model.n_u, fraction))
         found, acceleration = dynamics(state, held[-1], p)
         accelerations.append(acceleration)
         return found

@@ -31,7 +31,7 @@ from diransac.simulation.batch import (
     inlier_mask,
 )
 from diransac.simulation.compiler.machine_code import default_threads
-from diransac.simulation.integrators import HOLDS
+from diransac.simulation.integrators import input_columns, interpolated
 
 if TYPE_CHECKING:
     from diransac.model.mjcf import MujocoModel
@@ -291,15 +291,13 @@ class MujocoRollouts(Simulator):
     def _inputs(self, batch: RolloutBatch, substeps: int) -> FloatArray:
         """Inputs (n_log, substeps, n_u) at the middle of MuJoCo's steps; of a hold, at their beginning."""
         n_u = self._model.n_u
-        columns = HOLDS[self._hold].columns(batch.inputs, substeps, batch.logs)
-        k = np.arange(substeps)[None, :, None]
+        columns = input_columns(self._hold, batch.inputs, substeps, batch.logs)
         u = np.repeat(columns[:, None, :n_u], substeps, axis=1)
-        if columns.shape[1] > n_u:
-            first, second = columns[:, None, n_u : 2 * n_u], columns[:, None, 2 * n_u :]
-            u = u + (k + 0.5) * first
-            if second.shape[2]:
-                u = u + 0.5 * (k + 0.5) * (k - 0.5) * second
-        return u
+        if columns.shape[1] == n_u:
+            return u
+        first, second = columns[:, None, n_u : 2 * n_u], columns[:, None, 2 * n_u :]
+        middle = np.arange(substeps)[None, :, None] + 0.5
+        return np.asarray(interpolated(u, first, second, middle))
 
     @cached_property
     def _sizes(self) -> dict[str, float]:

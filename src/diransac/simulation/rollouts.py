@@ -44,6 +44,7 @@ from diransac.simulation.integrators import (
     Sensitivities,
     called_dynamics,
     calls_dynamics,
+    input_columns,
     loop_specification,
     sensitivities_of,
 )
@@ -190,7 +191,7 @@ class Rollouts(Simulator):
     ) -> tuple[FloatArray, FloatArray]:
         """Errors, and the states (n_lanes, n_x) one row after the last; see `Simulator.errors_and_ends`."""
         n_signals = len(self.signals)
-        lanes = self._lanes(batch)
+        lanes = self._few(self._lanes(batch))
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
         final = np.empty((lanes.n_lanes, len(self._model.state)))
         values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
@@ -199,9 +200,10 @@ class Rollouts(Simulator):
 
     def trajectories(self, batch: RolloutBatch, *, threads: int = 1) -> FloatArray:
         """All signals of the model, (n_lanes, n_rows, n_signals): states, accelerations; NaN from a divergence on."""
-        lanes = self._lanes(batch)
-        if lanes.n_lanes <= LANES:  # one vector reads rows of its own as fast: one machine code less
-            lanes = lanes.with_windows()
+        if self.signals != (every := tuple(self._model.signals)):  # whose code is the same
+            rest = self._integrator, self._substeps, self._hold, self._target
+            return _rollouts(self._model, every, *rest).trajectories(batch, threads=threads)
+        lanes = self._few(self._lanes(batch))
         series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
         final = np.empty((lanes.n_lanes, len(self._model.state)))
         self._run("SignalOutput", batch, lanes, {"series": series, "final": final}, threads)
@@ -218,7 +220,7 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
-        lanes = self._lanes(batch)
+        lanes = self._few(self._lanes(batch))
         names, sensitivities = self._unknowns(unknowns)
         n, n_x, n_z = lanes.n_lanes, len(self._model.state), len(names)
         first, matrix = np.empty((n, 1 + n_z)), np.empty((n if normal_matrix else 0, n_z, n_z))
@@ -250,7 +252,7 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> LinearizedErrors:
         """Errors and Jacobian row by row; see `Simulator.linearized_errors`."""
-        lanes = self._lanes(batch)
+        lanes = self._few(self._lanes(batch))
         names, sensitivities = self._unknowns(unknowns)
         n_s, n_z = len(self.signals), len(names)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
@@ -293,16 +295,21 @@ class Rollouts(Simulator):
 
     def _lanes(self, batch: RolloutBatch, inputs: FloatArray | None = None) -> Lanes:
         """Lanes of a batch as the time loop reads them, with other inputs where given."""
-        n_u, hold = self._model.n_u, HOLDS[self._hold]
+        n_u = self._model.n_u
         u = checked_array("inputs", batch.inputs if inputs is None else inputs, (None, n_u))
         return arranged_lanes(
-            (self._model.n_p, len(self._model.state), n_u + hold.n_changes(n_u)),
+            (self._model.n_p, len(self._model.state), 3 * n_u if self._varies else n_u),
             batch.parameters,
             batch.initial_states,
-            hold.columns(u, self._substeps, batch.logs),
+            input_columns(self._hold, u, self._substeps, batch.logs),
             batch.start_rows,
             batch.rows_per_lane,
         )
+
+    @staticmethod
+    def _few(lanes: Lanes) -> Lanes:
+        """Few lanes as if they started at different rows, which one vector reads as fast: one machine code less."""
+        return lanes.with_windows() if lanes.n_lanes <= LANES else lanes
 
     def _unknowns(self, unknowns: Sequence[str] | None) -> tuple[tuple[str, ...], Sensitivities]:
         """Names of the unknowns, checked, and the derivatives with respect to them."""
@@ -337,6 +344,11 @@ class Rollouts(Simulator):
         """True for code of rows with several sub-steps, which serves any number of them."""
         return self._substeps > 1
 
+    @property
+    def _varies(self) -> bool:
+        """True for code that serves both holds in which inputs vary between rows."""
+        return self._hold != "zero-order"
+
     def _derivatives(self, unknowns: tuple[str, ...]) -> Sensitivities:
         """Structure of the derivatives with respect to some unknowns, found when first needed."""
         with self._lock:
@@ -352,8 +364,8 @@ class Rollouts(Simulator):
                     self._model,
                     self.signals,
                     self._integrator,
-                    self._hold,
                     self._derivatives(unknowns) if unknowns else None,
+                    varying=self._varies,
                     divided=self._is_divided,
                 )
             return self._specifications[unknowns]
@@ -393,7 +405,7 @@ class Rollouts(Simulator):
         """Texts that determine `loop_specification`: all that it reads of the model, and its other arguments."""
         model = self._model
         sizes = (model.n_q, model.n_u, model.n_p, tuple(model.parameters), model.state, model.signals)
-        options = (self.signals, unknowns, self._integrator, self._is_divided, self._hold)
+        options = (self.signals, unknowns, self._integrator, self._is_divided, self._varies)
         jacobians = [model.rate_jacobians.serialize()] if unknowns else []
         return [repr((sizes, model.quaternions, options)), self._dynamics, *jacobians]
 

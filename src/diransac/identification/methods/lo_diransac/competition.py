@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
-from diransac.identification.estimate import Competition, Competitor, LogEstimate
+from diransac.identification.estimate import Competition, Competitor, LogEstimate, predicts
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
 from diransac.identification.methods.lo_diransac.interval_effects import effect_of_intervals
@@ -323,7 +323,9 @@ class Contest:
         return inlying | ~own.known, np.maximum(noise, floor)
 
     def challenger(self, search: Searched | None) -> int | None:
-        """Index of the best estimate that no fit gave, where it beats a fit, or contradicts one that predicts as well.
+        """Index of the best estimate that no fit gave, where it predicts, and beats or contradicts a fit.
+
+        One that predicts only as well is a reason for a second fit if it contradicts the first.
 
         Two estimates contradict each other if their intervals of a parameter are disjoint.  An exact model whose noise
         is not white is contradicted by that.
@@ -331,7 +333,7 @@ class Contest:
         assert self.comparison is not None
         as_good, fitted = self.comparison.as_good, np.array([not isinstance(x, Motion) for x in self.origins])
         found = int(np.argmin(np.where(as_good & ~fitted, self.comparison.losses, np.inf)))
-        if fitted[found] or not as_good[found]:
+        if fitted[found] or not as_good[found] or not predicts(self.scores[found].errors):
             return None
         if search is None or search.likeliest.exact or not (as_good & fitted).any():
             return found
