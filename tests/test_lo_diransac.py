@@ -51,8 +51,7 @@ def relative_errors(name, estimate):
     return np.abs(estimate.values / truth(name) - 1.0)
 
 
-@pytest.mark.parametrize("name", SMOOTH)
-@pytest.mark.parametrize("probability", [0.1, 0.5])
+@pytest.mark.parametrize(("name", "probability"), [("planar-rotorcraft", 0.1), *((name, 0.5) for name in SMOOTH)])
 def test_outliers_in_up_to_half_of_all_samples_leave_the_parameters_exact(name, probability):
     signals, inputs = flown(name)
     estimate = found(name, with_outliers(signals, probability, 30.0, seed=1, first_row="hit"), inputs)

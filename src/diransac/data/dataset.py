@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.log import Log
 from diransac.data.segment import Segment, bind_log, bulk_range
 from diransac.errors import LogError, SettingsError
@@ -436,7 +436,7 @@ def _spread(values: FloatArray) -> float:
     if len(values) == 0:
         return 0.0
     low, median, high = np.quantile(values, [0.1, 0.5, 0.9])
-    mad = 1.4826 * float(np.median(np.abs(values - median)))
+    mad = float(robust_std(values - median))
     wide = float(high - low) / 2.563
     if mad > 1e-2 * wide > 0.0:
         return mad

@@ -17,10 +17,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray, robust_std
 from diransac.data.input_timing import InputTiming
 from diransac.data.segment import runs
-from diransac.identification.regression.uncertainty import robust_std
 from diransac.identification.serialization import Masks, Number, Numbers, Series, Values, WholeNumbers
 
 
@@ -248,7 +247,7 @@ def departures(diagnosis: Diagnosis, log: int, unexplained: Mapping[str, float])
 def _scale(values: FloatArray) -> float:
     """Robust standard deviation about zero of the values that are not zero, as in gaps."""
     moving = values[values != 0.0]
-    return robust_std(moving) if len(moving) >= _FEWEST else 0.0
+    return float(robust_std(moving)) if len(moving) >= _FEWEST else 0.0
 
 
 def _ratio(values: FloatArray) -> FloatArray | None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.filters import median_filter
 from diransac.data.units import one_turn
 
@@ -198,8 +198,7 @@ def _agreeing(y: FloatArray, motion: FloatArray) -> BoolArray:
     around = _neighbours(len(y), reach)
     usual = y[_medoids(y[:, None], lambda a, b: np.abs(_remainder(a - b)[:, 0]), around)]
     off = np.abs(_remainder(usual - y))
-    # 1.4826: standard deviation from the median absolute one.
-    close = off <= np.clip(8.0 * 1.4826 * np.median(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
+    close = off <= np.clip(8.0 * robust_std(off) + _MUCH_MOTION * motion, _CLOSE, _FAR)
     agreement = np.abs(_remainder(y[around] - usual[:, None])) <= np.minimum(_CLOSE + reach * motion, _FAR)[:, None]
     return np.asarray(close & (agreement.mean(axis=1) >= 0.5))
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import MAD_TO_STD, BoolArray, FloatArray
 from diransac.data.filters import median_filter
 from diransac.data.preprocessing.continuity import unwrap
 from diransac.errors import SettingsError
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from diransac.data.log import Log
-
-_MAD_TO_STD = 1.4826
 
 
 def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, threshold: float = 8.0) -> Log:
@@ -104,7 +102,7 @@ def window_deviation(values: FloatArray, median: FloatArray, window: int) -> Flo
     Iglewicz and Hoaglin 1993, "How to detect and handle outliers", for the mean absolute deviation.
     """
     off = np.abs(_windows(values, window) - median[..., None])
-    scale = _MAD_TO_STD * _of_finite(_middle, off)
+    scale = MAD_TO_STD * _of_finite(_middle, off)
     scale = np.where(scale > 0.0, scale, 1.2533 * _of_finite(np.mean, off))
     return np.asarray(np.maximum(scale, np.apply_along_axis(_count, 0, values)))
 
@@ -115,7 +113,7 @@ def running_deviation(values: FloatArray, median: FloatArray, window: int) -> Fl
     Changes of the size that is usual over the whole signal, such as a controller's steps, are then no outliers.
     """
     whole = np.median(np.abs(values - np.median(values, axis=0)), axis=0)
-    return np.maximum(_MAD_TO_STD * _running_median(np.abs(values - median), window), _MAD_TO_STD * whole)
+    return np.maximum(MAD_TO_STD * _running_median(np.abs(values - median), window), MAD_TO_STD * whole)
 
 
 def _running_median(values: FloatArray, window: int) -> FloatArray:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.dataset import Dataset
 from diransac.errors import LogError
 from diransac.identification.diagnosis import Resolution
@@ -28,7 +28,6 @@ from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.methods.lo_diransac.without_equations import followed
-from diransac.identification.regression.uncertainty import robust_std
 
 _DIFFERENCE = 1e-6
 """Step of finite differences, over the spread of a state."""
@@ -126,7 +125,7 @@ def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:
         known = y[rows]
         residuals = known[1:-1] - (1.0 - later) * known[:-2] - later * known[2:]
         scaled = residuals / np.sqrt(1.0 + np.square(later) + np.square(1.0 - later))
-        found.append(robust_std(scaled))
+        found.append(float(robust_std(scaled)))
     return np.array(found)
 
 

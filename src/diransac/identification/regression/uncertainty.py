@@ -67,11 +67,6 @@ def jackknife_covariance(
     return covariance
 
 
-def robust_std(deviations: FloatArray) -> float:
-    """Standard deviation of normal deviations from zero, by the median of their sizes: up to half may be outliers."""
-    return 1.4826 * float(np.median(np.abs(deviations)))
-
-
 def rows_without(rows: IntArray, group: IntArray) -> IntArray:
     """Rows ``(n,)``, ascending, without those of a group, which are among them."""
     left = np.ones(len(rows), bool)

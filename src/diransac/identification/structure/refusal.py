@@ -11,13 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, robust_std
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
-from diransac.identification.regression.uncertainty import CLEAR, robust_std
+from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
@@ -65,7 +65,7 @@ def _moves(values: FloatArray) -> bool:
         return False
     if known.sum() < 30:
         return True
-    x = np.clip(x / (robust_std(size) or float(size.mean())), -1.5, 1.5)
+    x = np.clip(x / (float(robust_std(size)) or float(size.mean())), -1.5, 1.5)
     pairs = [(known[:-k] & known[k:], x[:-k] * x[k:]) for k in range(1, 6)]
     covariances = np.array([both @ product / max(1, both.sum()) for both, product in pairs])
     correlation = np.sqrt(np.mean(np.square(covariances))) / np.mean(np.square(x[known]))

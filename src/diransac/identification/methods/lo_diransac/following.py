@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.input_timing import acting_inputs
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.mixture import Mixture
@@ -39,7 +39,6 @@ _SMALL = 1e-3
 """Least change of a velocity of which the model lacks a part, over its size."""
 _FIRST_NOISE, _LEAST_NOISE, _TINY = 3.0, 1e-3, 1e-12
 """Noise of a signal before anything is fitted, over that of its bends; at least, over its spread."""
-_OF_NORMAL = 1.4826
 _LOST, _ROUNDING = 1e4, 1e-12
 _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
@@ -173,9 +172,9 @@ class Predictor:
         for j in np.flatnonzero(seen):
             y = intervals.measured[intervals.known[:, j], j]
             low[j], high[j] = y.min(), max(y.max(), y.min() + _TINY)
-            spread[j] = _robust(y - np.median(y)) or np.ptp(y) or 1.0
-            bends = np.diff(y, 2) if len(y) > _FIRST else np.zeros(1)
-            noise[j] = max(_FIRST_NOISE * _robust(bends) / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], _TINY)
+            spread[j] = float(robust_std(y - np.median(y))) or np.ptp(y) or 1.0
+            bends = float(robust_std(np.diff(y, 2))) if len(y) > _FIRST else 0.0
+            noise[j] = max(_FIRST_NOISE * bends / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], _TINY)
         pi = np.full(n, 0.1 if outliers else 0.0)
         floor = np.maximum(1e-2 * _LEAST_NOISE * spread, _TINY)
         whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
@@ -447,8 +446,3 @@ class _Update:
             left[:, :-1].T @ left[:, :-1],
             left[:, :-1].T @ left[:, -1],
         )
-
-
-def _robust(values: FloatArray) -> float:
-    """Standard deviation of the bulk."""
-    return float(_OF_NORMAL * np.median(np.abs(values)))

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.joint_equations import effect_on
@@ -435,7 +435,7 @@ def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, step
     for _ in range(steps):
         gains = least_squares_gains(rows.W, loss / scale)
         left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
-        spread = 1.4826 * np.median(np.abs(left[occupied]), axis=0)
+        spread = robust_std(left[occupied], axis=0)
         loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
     return np.asarray(loss / scale)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, robust_std
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 # Samples that a window has at least.
 _FEWEST = 5
 # Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
-_SPIKE_WINDOW, _SPIKE_PASSES, _MAD_TO_STD = 5, 20, 1.4826
+_SPIKE_WINDOW, _SPIKE_PASSES = 5, 20
 # Relative change of a signal that is a rounding error; steps of its resolution that are fewer than two.
 _ROUNDING, _ONE_STEP = 1e-9, 1.5
 
@@ -139,8 +139,8 @@ def _without_spikes_of_one(u: FloatArray, limit: float) -> FloatArray:
 
 def _noise_deviation(u: FloatArray) -> float:
     """Standard deviation of white noise by second differences; infinite where most of these are zero."""
-    usual = float(np.median(np.abs(np.diff(u, 2))))
-    return _MAD_TO_STD / np.sqrt(6.0) * usual if usual > 0.0 else np.inf
+    usual = float(robust_std(np.diff(u, 2)))
+    return usual / np.sqrt(6.0) if usual > 0.0 else np.inf
 
 
 # ---------------------------------------------------------------------- smoothing

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.checks import rows_per_sample
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.simulation.compiler import compile_map
@@ -418,7 +418,7 @@ def _neighbourhoods(knots: IntArray, half: int, n_rows: int) -> tuple[IntArray, 
 def _spread(values: FloatArray) -> FloatArray:
     """Standard deviation of each column by the MAD; by the central 80 % where half the samples have one value."""
     low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
-    mad, wide = 1.4826 * np.median(np.abs(values - median), axis=0), (high - low) / 2.563
+    mad, wide = robust_std(values - median, axis=0), (high - low) / 2.563
     return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, robust_std
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -186,7 +186,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     columns = [model.signals.index(n) for n in (*sampled, *model.sensors)]
     smoothed, known = motion.signals[:, columns], intervals.known[:, columns]
     apart = np.where(known, np.abs(intervals.measured[:, columns] - smoothed), 0.0)
-    noise = np.array([1.4826 * np.median(x[i]) if i.any() else 0.0 for x, i in zip(apart.T, known.T, strict=True)])
+    noise = np.array([robust_std(x[i]) if i.any() else 0.0 for x, i in zip(apart.T, known.T, strict=True)])
     inlying = known & (apart < _OUTLYING * noise + _TINY)
     values = np.where(inlying, intervals.measured[:, columns], np.nan_to_num(smoothed))
     weights = np.where(inlying, 1.0 / np.square(noise + _TINY), 0.0) / max(inlying.sum(), 1)
