@@ -250,9 +250,11 @@ def test_a_hostile_file_ends_in_one_sentence_that_names_it(tmp_path, name):
     assert len(text) < len(str(tmp_path)) + 400
 
 
-def test_no_file_and_a_folder_are_told_apart(tmp_path):
+def test_no_file_no_path_and_a_folder_are_told_apart(tmp_path):
     with pytest.raises(LogError, match="there is no such file"):
         read_log(tmp_path / "a.csv")
+    with pytest.raises(LogError, match="it cannot be read: embedded null byte"):
+        read_log(f"{tmp_path}/a\0.csv")
     with pytest.raises(LogError, match="it is a folder"):
         read_log(tmp_path)
 

@@ -51,6 +51,10 @@ MOST_JOINTS = 400
 _MIB = 2**20
 
 
+class SizeError(ValueError):
+    """A file is larger than it may be; the message is a part of a sentence."""
+
+
 def beyond(most: int, what: str, found: int | None = None) -> str:
     """Part of a sentence that refuses a size: ``12,000 columns; up to 10,000 are possible``.
 
@@ -97,11 +101,11 @@ def read_bytes(path: str | Path, largest: int) -> bytes:
     ------
     OSError
         The file cannot be read, or is not an ordinary one.
-    ValueError
-        It is larger; the message is a part of a sentence.
+    SizeError
+        It is larger.
     """
     size = check_ordinary(path).st_size
     if size > largest:
-        raise ValueError(f"it has {beyond(largest, 'bytes', size)}")
+        raise SizeError(f"it has {beyond(largest, 'bytes', size)}")
     with Path(path).open("rb") as file:
         return file.read(size)  # one that grows meanwhile is read as it was

@@ -22,7 +22,7 @@ from diransac.data.files import decode_metadata
 from diransac.data.filters import FilterSpecification
 from diransac.data.units import conversion, split_unit
 from diransac.errors import LogError
-from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, beyond
+from diransac.limits import MOST_COLUMNS, MOST_NUMBERS, MOST_ROWS, SizeError, beyond
 from diransac.plain_text import one_line
 
 DAMAGE: tuple[type[Exception], ...] = (
@@ -46,14 +46,13 @@ def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterat
 
 @contextmanager
 def readable(source: str) -> Iterator[None]:
-    """Context in which a file is opened and read.  Raises LogError: there is none, it cannot be read, or is too large.
-
-    A ValueError is that of `limits.read_bytes`.
-    """
+    """Context in which a file is opened and read.  Raises LogError: there is none, it is too large, or unreadable."""
     try:
         yield
-    except ValueError as error:
+    except SizeError as error:
         raise LogError(f"{source}: {error}; split it") from error
+    except ValueError as error:  # a path with a null byte
+        raise LogError(f"{source}: it cannot be read: {error}") from error
     except FileNotFoundError as error:
         raise LogError(f"{source}: there is no such file") from error
     except OSError as error:
