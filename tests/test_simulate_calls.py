@@ -70,7 +70,7 @@ def test_the_code_of_a_loop_does_not_grow_with_the_dynamics_that_it_calls():
         def series(q, v, u, p):
             return [v[0]], [u[0] - p[0] * sum(ca.sin((k + 1) * q[0]) for k in range(n))]
 
-        row = loop_specification(series, series.signals, "rk4", "zero-order", divided=False)
+        row = loop_specification(series, series.signals, "rk4", varying=False, divided=False)
         assert (row.dynamics is not None) == (n > 10)
         return str(emit_time_loop(row, ScoreOutput, inputs_from_log, windows=True)).count("\n")
 

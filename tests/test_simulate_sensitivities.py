@@ -328,7 +328,7 @@ def test_the_code_of_the_sums_grows_in_proportion_to_the_unknowns(divided):
             return [v[0]], [u[0] - sum(p[k] * ca.sin((k + 1) * q[0]) for k in range(n)) - p[n - 1] * v[0]]
 
         sensitivities = sensitivities_of(series, (*series.parameters, *series.state))
-        row = loop_specification(series, series.signals, "rk4", "zero-order", sensitivities, divided=divided)
+        row = loop_specification(series, series.signals, "rk4", sensitivities, varying=False, divided=divided)
         return str(emit_time_loop(row, GaussNewtonOutput, inputs_from_log, windows=True)).count("\n")
 
     few, more, many = lines(6), lines(12), lines(24)

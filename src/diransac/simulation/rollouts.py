@@ -191,7 +191,7 @@ class Rollouts(Simulator):
     ) -> tuple[FloatArray, FloatArray]:
         """Errors, and the states (n_lanes, n_x) one row after the last; see `Simulator.errors_and_ends`."""
         n_signals = len(self.signals)
-        lanes = self._few(self._lanes(batch))
+        lanes = self._lanes(batch)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_signals))
         final = np.empty((lanes.n_lanes, len(self._model.state)))
         values = arranged_measurements(lanes, n_signals, measurements.values, measurements.valid)
@@ -203,7 +203,9 @@ class Rollouts(Simulator):
         if self.signals != (every := tuple(self._model.signals)):  # whose code is the same
             rest = self._integrator, self._substeps, self._hold, self._target
             return _rollouts(self._model, every, *rest).trajectories(batch, threads=threads)
-        lanes = self._few(self._lanes(batch))
+        lanes = self._lanes(batch)
+        if lanes.n_lanes <= LANES:  # one vector reads rows of its own as fast: one machine code less
+            lanes = lanes.with_windows()
         series = np.empty((lanes.n_lanes, lanes.n_rows, len(self._model.signals)))
         final = np.empty((lanes.n_lanes, len(self._model.state)))
         self._run("SignalOutput", batch, lanes, {"series": series, "final": final}, threads)
@@ -220,7 +222,7 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
-        lanes = self._few(self._lanes(batch))
+        lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n, n_x, n_z = lanes.n_lanes, len(self._model.state), len(names)
         first, matrix = np.empty((n, 1 + n_z)), np.empty((n if normal_matrix else 0, n_z, n_z))
@@ -252,7 +254,7 @@ class Rollouts(Simulator):
         threads: int = 1,
     ) -> LinearizedErrors:
         """Errors and Jacobian row by row; see `Simulator.linearized_errors`."""
-        lanes = self._few(self._lanes(batch))
+        lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n_s, n_z = len(self.signals), len(names)
         series = np.empty((lanes.n_lanes, lanes.n_rows, n_s * (1 + n_z)))
@@ -305,11 +307,6 @@ class Rollouts(Simulator):
             batch.start_rows,
             batch.rows_per_lane,
         )
-
-    @staticmethod
-    def _few(lanes: Lanes) -> Lanes:
-        """Few lanes as if they started at different rows, which one vector reads as fast: one machine code less."""
-        return lanes.with_windows() if lanes.n_lanes <= LANES else lanes
 
     def _unknowns(self, unknowns: Sequence[str] | None) -> tuple[tuple[str, ...], Sensitivities]:
         """Names of the unknowns, checked, and the derivatives with respect to them."""
