@@ -142,7 +142,10 @@ def _delayed(recorded: FloatArray, delay: float) -> FloatArray:
 
 
 def _decaying(x: FloatArray, decay: float) -> FloatArray:
-    """Solution ``(N,)`` of ``y[k] = x[k] + decay * y[k - 1]`` by doubling: after k sums, each has 2^k terms."""
+    """Solution ``(N,)`` of ``y[k] = x[k] + decay * y[k - 1]`` by doubling: after k sums, each has 2^k terms.
+
+    Terms below rounding are left out.
+    """
     y, power, n = x.copy(), decay, 1
     while n < len(y) and power > 1e-18:
         y[n:] += power * y[:-n]

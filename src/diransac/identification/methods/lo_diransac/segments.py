@@ -162,7 +162,9 @@ class Segments:
         found = self._simulator.errors(
             self.batch(parameters, states), self.measurements, threads=self.intervals.threads
         )
-        if not np.isfinite(found.sum()):  # one pass instead of many
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = found.sum()
+        if not np.isfinite(total):  # one pass instead of many
             found = np.nan_to_num(found, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
         return found.reshape(*states.shape[:2], self.n_rows, -1)
 
