@@ -81,24 +81,6 @@ class Innovations:
         # Up to 0.2 innovations are nearly white, however many they are.
         return {n: x for n, x in largest.items() if abs(x) > 0.2 and self.whiteness[n] < 1e-3}
 
-    def spectrum(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Frequencies, Hz, and power density of a signal's normalised innovations, 1/Hz, by Welch's method.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        frequencies, density : (n,) array
-            White innovations of unit variance have the density ``2 dt``.
-        """
-        from scipy.signal import welch
-
-        x = np.nan_to_num(self.normalized[name])
-        f, density = welch(x, 1.0 / self.dt, nperseg=min(len(x), max(32, len(x) // 8)))
-        return np.asarray(f), np.asarray(density)
-
     def to_dict(self) -> dict[str, Any]:
         """Figures, ready for JSON."""
         return {
