@@ -44,7 +44,7 @@ class Competitor:
 
 
 def predicts(errors: Sequence[float] | FloatArray) -> bool:
-    """True for errors, over that of the prediction that nothing changes, of which one is much smaller than that."""
+    """True if an error at one of the horizons is less than half of that of the prediction that nothing changes."""
     return bool(np.min(errors) < 0.5)
 
 

@@ -108,12 +108,12 @@ def innovations(one: OpenLoop) -> Innovations | None:
     Parameters
     ----------
     one : OpenLoop
-        With smoothed states.  At most 1000 rows are filtered, and at least 50.
+        With smoothed states.  At most 3000 rows are filtered, and at least 50.
     """
     if one.smoothed is None:
         return None
     stretch = max(one.stretches, key=lambda x: x.stop - x.start)
-    rows = slice(stretch.start, min(stretch.stop, stretch.start + 1000))
+    rows = slice(stretch.start, min(stretch.stop, stretch.start + 3000))
     segment, n = one.segment, rows.stop - rows.start
     states, spread = one.filled_states()[rows], np.maximum(np.nanstd(segment.measured, axis=0), 1e-300)
     measured = np.where(one.outliers, np.nan, segment.measured)[rows]

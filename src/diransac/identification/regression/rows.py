@@ -149,7 +149,7 @@ def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]
     """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit size; number of equations."""
     parts = []
     for i, one in enumerate(logs):
-        every = max(1, len(one.q) // 2000)  # enough to find a cause
+        every = max(1, len(one.q) // 5000)  # enough to find a cause
         few = (np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y))
         W, b = regression_rows(model, *few)
         W = layout.scattered(W, i)

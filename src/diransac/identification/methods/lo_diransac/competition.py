@@ -323,9 +323,7 @@ class Contest:
         return inlying | ~own.known, np.maximum(noise, floor)
 
     def challenger(self, search: Searched | None) -> int | None:
-        """Index of the best estimate that no fit gave, where it predicts, and beats or contradicts a fit.
-
-        One that predicts only as well is a reason for a second fit if it contradicts the first.
+        """Index of the best estimate that no fit gave, where it predicts, and beats a fit or contradicts one as good.
 
         Two estimates contradict each other if their intervals of a parameter are disjoint.  An exact model whose noise
         is not white is contradicted by that.
