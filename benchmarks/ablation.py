@@ -99,7 +99,6 @@ def _parts() -> dict[str, Part]:
         "second fit": _without_source("second fit"),
         "competition": Part(replace(DEFAULT, sources=())),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
-        "price of another timing": Part(patches=(("arbiter._TIMING", 0.0),)),
         "exact fits that cannot win end early": Part(
             patches=(("refinement._is_lost", lambda *_: False), ("local_search.Explanation.exact_is_hopeless", False))
         ),

@@ -195,7 +195,7 @@ def arbiter(bound: tuple, horizon: float | None = None) -> Arbiter:
 
 def comparison(candidates: list[Candidate], bound: tuple) -> Comparison:
     judge = arbiter(bound)
-    return Comparison.of([judge.scores(x) for x in candidates], np.zeros(len(candidates), bool))
+    return Comparison.of([judge.scores(x) for x in candidates])
 
 
 def test_better_predictions_win_whatever_their_order(bound: tuple) -> None:
@@ -225,18 +225,10 @@ def scores(losses: list[list[float]], errors: list[float]) -> Scores:
     return Scores(np.array(errors), np.array(losses))
 
 
-def test_another_timing_must_reduce_the_loss_by_a_fifth() -> None:
-    recorded, late = scores([[1e-2, 1.1e-2, 0.9e-2]], [0.1]), scores([[0.9e-2, 1.0e-2, 0.8e-2]], [0.1])
-    assert Comparison.of([recorded, late], np.array([False, False])).best == 1
-    assert Comparison.of([recorded, late], np.array([False, True])).best == 0
-    much = scores([[0.5e-2, 0.6e-2, 0.4e-2]], [0.1])
-    assert Comparison.of([recorded, much], np.array([False, True])).best == 1
-
-
 def test_horizons_that_nothing_predicts_do_not_count() -> None:
     right = scores([[1e-2, 1.1e-2, 0.9e-2], [0.8, 0.9, 1.0]], [0.1, 3.0])
     dull = scores([[2e-2, 2.1e-2, 1.9e-2], [0.2, 0.3, 0.1]], [0.2, 1.2])
-    assert Comparison.of([dull, right], np.zeros(2, bool)).best == 1
+    assert Comparison.of([dull, right]).best == 1
 
 
 def test_weights_are_those_of_a_difference_in_another_log() -> None:
@@ -244,7 +236,7 @@ def test_weights_are_those_of_a_difference_in_another_log() -> None:
     factors = np.exp([0.2, 0.4, 0.0, 0.2])
     other = scores([(base * factors).tolist()], [0.1])
     z = 0.2 / (np.std([0.2, 0.4, 0.0, 0.2]) / np.sqrt(3.0))
-    found = Comparison.of([scores([base.tolist()], [0.1]), other], np.zeros(2, bool))
+    found = Comparison.of([scores([base.tolist()], [0.1]), other])
     np.testing.assert_allclose(found.weights, [1.0, np.exp(-0.25 * z**2)], rtol=1e-2)
 
 

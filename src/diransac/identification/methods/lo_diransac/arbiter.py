@@ -35,9 +35,8 @@ _SCALES = (0.125, 0.5, 2.0, 8.0)
 _FEWEST_ROWS, _PART = 4, 3
 """Rows of the shortest horizon, and stretches over segments at least."""
 _LOST = 1e4
-_AS_WELL, _TIMING = 0.02, float(np.log(1.25))
-"""Difference of the logarithms of losses that does not count, and by how much another timing of the inputs must win: a
-controller answers disturbances, so that late inputs predict these."""
+_AS_WELL = 0.02
+"""Difference of the logarithms of losses that does not count."""
 _NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
 """Loss in comparison with which all are equal: a thousandth of the motion."""
 
@@ -83,8 +82,8 @@ class Comparison:
     losses: FloatArray
 
     @classmethod
-    def of(cls, scores: Sequence[Scores], timed: BoolArray) -> Comparison:
-        """Comparison of candidates, ``timed (n,)`` those with another timing of the inputs than was recorded.
+    def of(cls, scores: Sequence[Scores]) -> Comparison:
+        """Comparison of candidates.
 
         Horizons over which no candidate predicts better than that nothing changes do not count: there, an unstable
         machine is lost, and estimates that respond less to their inputs have the smaller errors.
@@ -92,7 +91,7 @@ class Comparison:
         told = np.fmin.reduce([x.errors for x in scores]) < 1.0
         told = told if told.any() else np.ones_like(told)
         losses = _means(np.array([x.losses[told] for x in scores]).swapaxes(1, 2))
-        logs = np.log(losses + _NEGLIGIBLE) + _TIMING * timed[:, None]
+        logs = np.log(losses + _NEGLIGIBLE)
         first = int(np.nanargmin(_means(logs)))
         difference, error = _differences(logs, first)
         quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor, LogEstimate, predicts
 from diransac.identification.method import report, within
@@ -291,7 +290,7 @@ class Contest:
         scores = self.scores
         if not any(np.isfinite(x.losses).any() for x in scores):
             return None
-        self.comparison = Comparison.of(scores, self._timed)
+        self.comparison = Comparison.of(scores)
         best = self.comparison.best
         winner = self.entries[best].candidate
         errors = ", ".join(f"{x:.2g}" for x in scores[best].errors)
@@ -299,12 +298,6 @@ class Contest:
         parameters = dict(zip(self.dataset.layout.names, winner.parameters.tolist(), strict=True))
         report(self.callback, "comparing predictions", 0.89, best_so_far, parameters=parameters)
         return best
-
-    @property
-    def _timed(self) -> BoolArray:
-        """Mask of the candidates whose inputs act at another time than was recorded, unasked."""
-        forced = self.settings.forces_timing
-        return np.array([not forced and x.acting.timing != InputTiming() for x in self.candidates])
 
     def _judged_by(self, search: Searched | None) -> Arbiter | None:
         """The arbiter with the outliers and the noise of a search."""
@@ -391,7 +384,7 @@ class Contest:
         mean = replace(
             one, parameters=share @ parameters, without=np.tensordot(share, [x.without for x in self.candidates], 1)
         )
-        alone = Comparison.of([self.scores[winner], self.arbiter.scores(mean)], np.zeros(2, bool))
+        alone = Comparison.of([self.scores[winner], self.arbiter.scores(mean)])
         centre = mean.parameters if alone.as_good[1] else one.parameters
         apart = parameters - centre
         spread = (weights * apart.T) @ apart / weights.sum()
