@@ -23,7 +23,8 @@ quick: $(ENVIRONMENT)  ## tests without the slow ones
 # Others every time; FUZZ_EXAMPLES files of each kind.
 FUZZ_EXAMPLES ?= 200
 fuzz: $(ENVIRONMENT)  ## damaged files of every kind, and entries of the cache of machine code
-	FUZZ_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/pytest -q -s tests/test_fuzz.py tests/test_code_cache.py -k "damaged_file or changed_byte"
+	FUZZ_EXAMPLES=$(FUZZ_EXAMPLES) $(BIN)/pytest -q -s tests/test_fuzz.py tests/test_code_cache.py tests/test_hostile_logs.py \
+		-k "damaged_file or changed_byte or hostile_logs"
 
 lint: $(ENVIRONMENT)
 	$(BIN)/ruff check .

@@ -1,4 +1,10 @@
-"""Every method answers hostile logs with finite parameters or one sentence: no warning, no text of LAPACK."""
+"""Every method answers hostile logs with finite parameters or one sentence: no warning, no text of LAPACK.
+
+The suite meets every pair of hostility, equations and method; `make fuzz` every triple.
+"""
+
+import os
+from itertools import product
 
 import numpy as np
 import pytest
@@ -72,11 +78,14 @@ HOSTILE = {
 
 
 LINEAR = ("ols", "tls")
-CASES = [(name, method) for name in MODELS for method in dr.METHODS if not (name == "not affine" and method in LINEAR)]
+CASES = [
+    (hostility, equations, method)
+    for (i, hostility), (j, equations), (k, method) in product(*map(enumerate, (HOSTILE, MODELS, dr.METHODS)))
+    if not (equations == "not affine" and method in LINEAR) and ("FUZZ_EXAMPLES" in os.environ or (i + j - k) % 4 == 0)
+]
 
 
-@pytest.mark.parametrize(("equations", "method"), CASES)
-@pytest.mark.parametrize("hostility", HOSTILE)
+@pytest.mark.parametrize(("hostility", "equations", "method"), CASES)
 def test_hostile_logs_give_finite_parameters_or_a_sentence(hostility, equations, method, capfd):
     """Warnings are errors here, as everywhere in these tests."""
     log = dr.Log.from_arrays(DT * ROWS, HOSTILE[hostility](slide()), source="log")
