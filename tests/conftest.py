@@ -1,8 +1,7 @@
-"""Fixtures that every test may use, one thread per worker of pytest-xdist, and machine code kept for this run alone."""
+"""Fixtures that every test may use, one thread per worker of pytest-xdist, and machine code kept from run to run."""
 
 import gc
 import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,13 +16,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # there is a worker per core; BLAS read
     os.environ.setdefault("DIRANSAC_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-if "PYTEST_XDIST_WORKER" not in os.environ:  # workers and child processes inherit the folder
-    MACHINE_CODE = tempfile.TemporaryDirectory(prefix="diransac-tests-", ignore_cleanup_errors=True)
-    os.environ["DIRANSAC_CACHE"] = MACHINE_CODE.name
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without byte code, each of them compiles the whole package again
-
 REPOSITORY = Path(__file__).resolve().parents[1]
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+
+# A key of the cache holds the compiler's sources: code of an earlier run is that which this one would compile.
+os.environ["DIRANSAC_CACHE"] = str(REPOSITORY / ".pytest_cache" / "machine-code")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without byte code, each process compiles the whole package again
 
 
 def pytest_collection_finish() -> None:

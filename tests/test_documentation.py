@@ -1,7 +1,7 @@
 r"""README.md, CONTRIBUTING.md and docs/, run as they are shown.
 
 A page runs from top to bottom in a folder of its own, with ``examples/`` inside and the real logs in
-``../shared/data``:
+``../shared/data``, of which the longest are cut short:
 
 - every ``python`` block, in one namespace per page;
 - a ``python`` or ``toml`` block whose first line is a comment that names a file (``# rover.py``) is written to that
@@ -26,7 +26,9 @@ from typer.testing import CliRunner
 from diransac.cli.commands import app
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SHARED = REPOSITORY.parent / "shared"
+SHARED = REPOSITORY.parent / "shared" / "data"
+AXIS, PENDULUM = "emps/DATA_EMPS.csv", "dfki_double_pendulum"
+"""Logs that are cut short."""
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 NOT_RUN = {"cd", "git", "make", "pip"}
 NEEDS = {"robots.md": "mujoco", "logs.md": "mcap", "tutorial.md": "mcap"}
@@ -93,9 +95,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_proce
     checkout.mkdir()
     (checkout / "examples").symlink_to(REPOSITORY / "examples")
     if SHARED.is_dir():
-        (tmp_path / "shared").symlink_to(SHARED)
+        cut_short(tmp_path / "shared" / "data")
     monkeypatch.chdir(checkout)
     return checkout
+
+
+def cut_short(data: Path) -> None:
+    """Link the real logs, but for two thirds of the axis' rows and of the pendulum's runs."""
+    for path in SHARED.glob("*/*"):
+        (data / path.parent.name).mkdir(parents=True, exist_ok=True)
+        (data / path.relative_to(SHARED)).symlink_to(path)
+    rows = (SHARED / AXIS).read_text().splitlines(keepends=True)
+    for path in (data / AXIS, *sorted((data / PENDULUM).iterdir())[3:]):
+        path.unlink()
+    (data / AXIS).write_text("".join(rows[: len(rows) // 3]))
 
 
 @pytest.mark.slow

@@ -132,10 +132,10 @@ def methods_of_a_trial():
 
 def test_results_do_not_depend_on_earlier_methods_of_the_same_logs():
     logs = [as_log(PLANE, *spoilt(seed=k), 0.02) for k in (0, 1)]
-    for some in (logs[:1], logs):
+    for some, seeds in ((logs[:1], (4, 5)), (logs, (4,))):
         together = Identification(MODEL, some)
         for method in methods_of_a_trial():
-            for seed in (4, 5):
+            for seed in seeds:
                 alone = dr.identify(MODEL, some, method, seed=seed)
                 assert json.dumps(together.by(method, seed).to_dict()) == json.dumps(alone.to_dict())
 
@@ -267,7 +267,7 @@ def test_with_outliers_i_diransac_beats_diransac_beats_least_squares():
     medians = {}
     for method in ("i-diransac", "diransac", "ols"):
         worst, errors = [], []
-        for seed in range(7):
+        for seed in range(3):
             log = as_log(PLANE, with_outliers(signals, 0.1, 80.0, seed), inputs, 0.01)
             result = dr.identify(MODEL, log, method, seed=seed, settings=given_to(method, dr.Settings.table_iv()))
             worst.append(max(abs(result.parameters[n] / x - 1.0) for n, x in PLANE.truth.items()))
@@ -512,7 +512,7 @@ USED = {
 @pytest.mark.parametrize(("name", "value"), EVERY_SETTING)
 @pytest.mark.parametrize("method", dr.METHODS)
 def test_setting_that_a_method_has_no_use_for_is_refused_and_others_are_not(method, name, value):
-    log, settings = as_log(PLANE, *spoilt(n_rows=200), 0.02), dr.Settings(**{name: value})
+    log, settings = as_log(PLANE, *flight(PLANE, 200, 0.02), 0.02), dr.Settings(**{name: value})
     if name in USED[method]:
         assert dr.identify(MODEL, log, method, settings=settings).settings == settings
         return

@@ -119,7 +119,7 @@ def flight(frame="x", lag=0.0, n_rows=1000, dt=0.01, substeps=3):
 
 def recorded(frame="x", lag=0.0):
     """Log of a flight without noise."""
-    time, columns = flight(frame, lag)
+    time, columns = flight(frame, lag, n_rows=300)
     return dr.Log.from_arrays(time, columns)
 
 
@@ -191,7 +191,7 @@ def test_parameters_are_within_their_intervals_with_noise_and_outliers():
 @pytest.mark.slow
 def test_imu_and_attitude_determine_all_parameters_without_a_position():
     """The rotors' drag is what the accelerometer sees of the velocity, which nothing measures."""
-    time, columns = flight(n_rows=300)
+    time, columns = flight("x", 0.0, n_rows=300)
     rng = np.random.default_rng(2)
     readings = [f"{sensor}_{axis}" for sensor in BIASES for axis in "xyz"]
     noise = {

@@ -9,6 +9,8 @@ import regimes
 from regime_judging import METHODS, UNRELIABLE, Record
 from regime_output_error import output_error
 
+from regime_logs import of_table
+
 SHORT = 0.8
 """Seconds that are simulated where the length does not matter."""
 EXACT = {name: regime for name, regime in flights.REGIMES.items() if regime.exact}
@@ -100,9 +102,8 @@ def test_a_late_signal_repeats_the_exact_one_and_a_gap_has_its_length():
 @pytest.mark.parametrize(("regime", "bound"), [("pendulum clean", 1.0), ("car continuous input", 3.0)])
 @pytest.mark.parametrize("method", [baselines.ordinary, baselines.total, output_error])
 def test_baselines_find_the_truth_of_an_exact_model(method, regime, bound):
-    regime = flights.REGIMES[regime]
-    recording = flights.recordings(regime, [1002])[0]
-    found = method(regime, recording)
+    recording = of_table(regime, 1002)
+    found = method(flights.REGIMES[regime], recording)
     assert max(abs(100.0 * (found[name] / x - 1.0)) for name, x in recording.truth.items()) < bound
 
 

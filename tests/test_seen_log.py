@@ -30,23 +30,20 @@ def test_a_log_as_it_was_recorded_needs_no_option(folder):
         assert all(fraction < 0.08 for fraction in validated["outlier_fraction"].values())
 
 
-@pytest.mark.parametrize("options", [["--differentiate"], ["--map", "t=time"], ["--scale", "t=0.001"]])
-def test_options_of_earlier_versions_change_nothing(folder, options):
+def test_options_of_earlier_versions_change_nothing(folder):
     write_log(folder / "log.csv", 1, n=1000, lost=4)
-    run("identify", "log.csv", "--model", "model.py", "-o", "result.json")
-    run("identify", "log.csv", "--model", "model.py", *options, "-o", "same.json")
-    result, same = (json.loads(Path(name).read_text()) for name in ("result.json", "same.json"))
-    assert result["parameters"] == same["parameters"]
-    with_options = json.loads(run("validate", "result.json", "log.csv", *options, "--json").stdout)
-    assert with_options["rmse"] == json.loads(run("validate", "result.json", "log.csv", "--json").stdout)["rmse"]
+    found = []
+    for options in ([], ["--differentiate"], ["--map", "t=time"], ["--scale", "t=0.001"]):
+        run("identify", "log.csv", "--model", "model.py", *options, "-o", "result.json")
+        validated = json.loads(run("validate", "result.json", "log.csv", *options, "--json").stdout)
+        found.append((json.loads(Path("result.json").read_text())["parameters"], validated["rmse"]))
+    assert found == [found[0]] * 4
 
 
 @pytest.mark.slow
-def test_pairs_of_faulty_logs_are_usable(folder):
-    """The first two pairs of `benchmarks/faulty_pairs.py`, with 2 to 10 % outliers, gaps and jitter."""
-    for seed in range(2):
-        write_pair(folder, seed)
-        run("identify", "log.csv", "--model", "model.py", "-o", "result.json")
-        for log in ("log.csv", "other.csv"):
-            validated = json.loads(run("validate", "result.json", log, "--json").stdout)
-            assert validated["verdict"] == "usable", (seed, log)
+def test_a_pair_of_faulty_logs_is_usable(folder):
+    """The first pair of `benchmarks/faulty_pairs.py`, with 2 to 10 % outliers, gaps and jitter."""
+    write_pair(folder, 0)
+    run("identify", "log.csv", "--model", "model.py", "-o", "result.json")
+    for log in ("log.csv", "other.csv"):
+        assert json.loads(run("validate", "result.json", log, "--json").stdout)["verdict"] == "usable", log

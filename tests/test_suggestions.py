@@ -355,12 +355,6 @@ def test_the_suggested_term_lies_over_the_unmodelled_force(with_dry_friction, re
     assert 'class="trace line suggested"' in page
 
 
-def test_without_suggestions_nothing_lies_over_the_unmodelled_forces():
-    found = dr.identify(pendulum(), swing(), differentiate=True).diagnosis
-    assert not found.suggested_terms
-    assert not found.of_log(0, slice(None)).suggested_terms
-
-
 def test_suggestions_are_printed_and_survive_json(result):
     (found,) = result.suggestions
     assert found.text in str(result)
@@ -383,6 +377,8 @@ def test_of_an_exact_model_nothing_is_suggested_and_nothing_added():
     assert not found.suggestions
     assert list(found.parameters) == ["inertia", "damping", "moment"]
     assert "no terms were suggested" in found.notes[0]
+    assert not found.diagnosis.suggested_terms
+    assert not found.diagnosis.of_log(0, slice(None)).suggested_terms
 
 
 @pytest.mark.parametrize(
