@@ -85,14 +85,12 @@ def test_parameters_are_within_their_intervals_with_noise_and_outliers(name):
 @pytest.mark.parametrize(
     ("name", "noise", "fixed", "within"),
     [
-        ("flexible-joint", {"motor": 5e-4}, (), 0.02),
         ("dc-motor", {"angle": 0.01}, ("torque_constant", "resistance"), 0.1),
         ("voltage-drive", {"yaw_rate": 0.02, "left_wheel": 0.1, "right_wheel": 0.1}, ("mass",), 0.02),
-        ("single-track-vehicle", {"yaw_dot": 5e-3, "lateral_acceleration": 0.1}, ("mass",), 0.02),
     ],
 )
 def test_what_vehicles_and_drives_usually_measure_is_enough(name, noise, fixed, within):
-    """The load of a joint, the current of a motor, a robot's pose and the lateral velocity of a car are unmeasured."""
+    """The current of a motor and a robot's pose are unmeasured."""
     log = recorded(name, noise, outliers=0.08, seed=1)
     values = {parameter: MACHINES[name].truth[parameter] for parameter in fixed}
     result = dr.identify(CASES[name].model, log, fixed=values, differentiate=True)

@@ -48,12 +48,6 @@ def test_equations_without_a_known_term_do_not_make_all_parameters_vanish():
     assert not any("converge" in x for x in found.findings)  # along the valley of its collinear parameters
 
 
-def test_velocities_that_are_not_logged_follow_from_the_kinematics():
-    found = judged("quad mocap and gyro")
-    assert found.worst < 0.5
-    assert found.verdict == "usable"
-
-
 def test_a_lag_of_the_actuators_is_estimated_and_named():
     found = judged("rotor motor lag 50 ms")
     assert found.worst < 0.2

@@ -119,14 +119,14 @@ def thrust_signals():
 
 @cache
 def joint_signals():
-    t = np.arange(1600) * 0.005
+    t = np.arange(1100) * 0.005
     return motion_of_joint(JOINT, t, 1.5 * excitation(t, 3, 5.0) + 0.5 * np.sign(excitation(t, 9, 2.0)))
 
 
 @cache
 def stiff_joint_signals():
     """A joint with a resonance at 12 Hz that is hardly damped."""
-    t = np.arange(2000) * 0.005
+    t = np.arange(1300) * 0.005
     return motion_of_joint(STIFF, t, 0.9 * excitation(t, 34, 9.0))
 
 
@@ -516,10 +516,9 @@ def weighed_log(seed, noise, outliers, *, sensor_lag=True, correlated=0.0):
     return dr.Log.from_arrays(t, {"acc": acc + noise * rng.standard_normal(n) + drift + wild, "command": command})
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_an_accelerometer_alone_shows_two_lags(seed):
+def test_an_accelerometer_alone_shows_two_lags():
     """Nothing but the sensor gives the search of the unmeasured states a direction."""
-    found = dr.identify(weighed_thrust(), weighed_log(seed, 0.1, 0.1), differentiate=True)
+    found = dr.identify(weighed_thrust(), weighed_log(0, 0.1, 0.1), differentiate=True)
     lags = sorted(found.parameters[n] for n in ("tau", "sensor_tau"))  # they may be exchanged
     assert [*(found.parameters[n] for n in ("linear", "square")), *lags] == pytest.approx([*WEIGHED.values()], rel=0.15)
     assert_needs_no_care_but_for_terms(found)  # commands vary by a tenth of their mean

@@ -304,14 +304,14 @@ def model_file(_: Path) -> Kind:
 
 SEARCH = "--model underwater-vehicle --method i-diransac --time-limit 1"
 KINDS = {
-    "results": (40, lambda folder: result(changed_result, folder)),
-    "names": (20, names),
+    "results": (20, lambda folder: result(changed_result, folder)),
+    "names": (10, names),
     "files beside": (8, files_beside),
-    "equations": (20, lambda folder: result(changed_graph, folder)),
-    "stores": (30, study_store),
-    "fleets": (15, fleet_store),
-    "studies": (30, study_file),
-    "csv": (15, lambda _: log("log.csv", table(), changed_table)),
+    "equations": (10, lambda folder: result(changed_graph, folder)),
+    "stores": (15, study_store),
+    "fleets": (8, fleet_store),
+    "studies": (15, study_file),
+    "csv": (8, lambda _: log("log.csv", table(), changed_table)),
     "csv with metadata": (8, lambda folder: log("log.csv", columns(".csv", folder), changed_table)),
     "csv.gz": (8, lambda folder: log("log.csv.gz", columns(".csv.gz", folder))),
     "parquet": (8, lambda folder: log("log.parquet", columns(".parquet", folder))),

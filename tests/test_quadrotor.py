@@ -182,6 +182,7 @@ def test_parameters_are_within_their_intervals_with_noise_and_outliers():
         measured[name] = y + scale * rng.standard_normal(len(time)) + hit * wild
     log = dr.Log.from_arrays(time, measured)
     result = dr.identify(dr.models.quadrotor(arm_length=ARM), log, fixed=MASS, differentiate=True)
+    assert result.verdict == "usable"
     for name, value in result.parameters.items():
         error = abs(value - TRUTH[name])
         assert error <= 0.01 * TRUTH[name], name

@@ -13,7 +13,7 @@ from robot_intervals import BIAS, DELAY, JOINTS, LEG, TRUTH, model_of, recorded 
 def test_joints_and_encoders_are_found_from_positions_and_late_targets(tmp_path):
     path = tmp_path / "leg.xml"
     path.write_text(LEG)
-    result = dr.identify(model_of(path, "encoder_bias"), recorded(path, duration=6.0), differentiate=True)
+    result = dr.identify(model_of(path, "encoder_bias"), recorded(path, duration=3.0), differentiate=True)
     for k, joint in enumerate(JOINTS):
         for kind, values in TRUTH.items():
             name, error = f"{kind}_{joint}", abs(result.parameters[f"{kind}_{joint}"] - values[k])
