@@ -54,7 +54,10 @@ COMMANDS = {
 """Command lines, and the files that each writes."""
 
 STORES = {
-    "study": ("study run tiny.toml --store out.db --trials 1", "study run tiny.toml --store out.db"),
+    "study": (
+        "study run tiny.toml --store out.db --methods true --trials 1",
+        "study run tiny.toml --store out.db --methods true",
+    ),
     "fleet": (f"identify a.csv {FIT} --each --store out.db", f"identify a.csv b.csv {FIT} --each --store out.db"),
 }
 """Command lines that write a part of the rows of a store, and all of them."""

@@ -1,10 +1,9 @@
 """Parts of the gauntlet: what is flown, what is true, and what is counted."""
 
 import json
-import subprocess
-import sys
+import os
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from pathlib import Path
 
 import gauntlet
 import gauntlet_judging as judging
@@ -17,7 +16,6 @@ import diransac as dr
 from diransac.study.store import Store
 from diransac.study.trials import run_trials
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 WORST = {"servo-axis": "cogging", "double-pendulum": "ripple", "pendulum": "ripple"}
 
 
@@ -173,16 +171,18 @@ def test_names_have_no_commas():
     assert not any("," in name for name in names)
 
 
-def test_processes_find_what_one_process_finds_and_in_order():
+def test_jobs_find_what_one_trial_at_a_time_finds_and_in_order(monkeypatch, capsys):
     chosen = ["--vehicle", "servo-axis", "--scenario", "clean,outliers .1 x 80", "--methods", "tls,ols"]
-    command = [sys.executable, str(BENCHMARKS / "gauntlet.py"), *chosen, "--jobs", "2", "--flight", "drawn", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    monkeypatch.setattr(gauntlet, "ProcessPoolExecutor", lambda jobs, _: ThreadPoolExecutor(jobs))
+    monkeypatch.setattr(gauntlet.os, "environ", dict(os.environ))
+    gauntlet.main([*chosen, "--jobs", "2", "--flight", "drawn", "--json"])
+    done = capsys.readouterr()
     expected = [
         one for name in ("clean", "outliers .1 x 80")
         for one in judging.run(judging.Trial("servo-axis", "drawn", name, 0), ["ols", "tls"])
     ]  # fmt: skip
-    found = json.loads(done.stdout)
-    assert "2/2" in done.stderr
+    found = json.loads(done.out)
+    assert "2/2" in done.err
     assert [(one["trial"]["scenario"], one["method"]) for one in found] == [
         (one.trial.scenario, one.method) for one in expected
     ]

@@ -51,10 +51,10 @@ def relative_errors(name, estimate):
     return np.abs(estimate.values / truth(name) - 1.0)
 
 
-@pytest.mark.parametrize(("name", "probability"), [("planar-rotorcraft", 0.1), *((name, 0.5) for name in SMOOTH)])
-def test_outliers_in_up_to_half_of_all_samples_leave_the_parameters_exact(name, probability):
+@pytest.mark.parametrize("name", SMOOTH)
+def test_outliers_in_half_of_all_samples_leave_the_parameters_exact(name):
     signals, inputs = flown(name)
-    estimate = found(name, with_outliers(signals, probability, 30.0, seed=1, first_row="hit"), inputs)
+    estimate = found(name, with_outliers(signals, 0.5, 30.0, seed=1, first_row="hit"), inputs)
     assert relative_errors(name, estimate).max() < 1e-3
 
 

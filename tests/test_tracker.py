@@ -137,9 +137,8 @@ def test_intervals_hold_the_truth_while_it_is_not_clear_what_else_has_changed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gust", "gust_from"), [(0.3, 0.0), (0.5, 8.0)])
-def test_gusts_and_outliers_are_no_changes(gust, gust_from):
-    log = flown(1800, 2, gust=gust, gust_from=gust_from)
+def test_gusts_and_outliers_are_no_changes():
+    log = flown(1800, 2, gust=0.5, gust_from=8.0)
     assert [x for now in dr.track(MODEL, log, start=ROUGH) for x in now.changes] == []
 
 
