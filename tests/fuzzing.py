@@ -32,6 +32,8 @@ from diransac.model.model import _checksum
 from hostile import NAMES, TEXTS
 from read_back import check_printed, check_reads_back
 
+_MET: set[tuple[bytes, str]] = set()
+"""Undamaged files with the commands that have had them."""
 BESIDE = "-metadata.json"
 """Ending of the metadata beside a CSV file."""
 MOST_LINES, MOST_SECONDS, MOST_MEMORY = 3, 60, 2**30
@@ -551,8 +553,11 @@ class Kind:
         return outcome(folder, chosen.words, chosen.outputs, self.memory)
 
     def undamaged(self, folder: Path) -> Iterator[tuple[Command, int]]:
-        """Every command over every undamaged file, and its exit code."""
+        """Every command over every undamaged file that it has not had for another kind, and its exit code."""
         for data, one in itertools.product(self.data, self.commands):
+            if (data, one.words) in _MET:
+                continue
+            _MET.add((data, one.words))
             self.place(folder, data)
             yield one, outcome(folder, one.words, one.outputs)
 
