@@ -109,3 +109,13 @@ def write_swim(path: Path, n_rows: int = 600, start: float = 0.0) -> None:
     """A log of an underwater vehicle."""
     t = np.arange(n_rows) * 0.01
     dr.Log.from_arrays(t, swim(t + start)).write(path)
+
+
+def write_spring(path: Path) -> None:
+    """A log of an underwater vehicle on a spring, with noise."""
+    t = np.arange(300) * 0.01
+    columns = swim(t)
+    columns["thrust"] = columns["thrust"] + 40.0 * columns["x"]
+    noise = 0.001 * np.random.default_rng(0).standard_normal((2, 300))
+    columns |= {"x": columns["x"] + noise[0], "x_dot": columns["x_dot"] + noise[1]}
+    dr.Log.from_arrays(t, {n: columns[n] for n in ("x", "x_dot", "thrust")}).write(path)

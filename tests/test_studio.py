@@ -9,14 +9,13 @@ import subprocess
 import sys
 import time
 import urllib.request
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import diransac as dr
-from command_line import run, swim, working_folder
+from command_line import run, working_folder
 from diransac import time_limit
 from diransac.data import preprocessing
 from diransac.identification.assessment.inspection import inspect
@@ -28,9 +27,10 @@ from diransac.studio.folders import Folders
 from diransac.studio.scene import _content
 from diransac.studio.series import Logs
 from diransac.studio.stages import lines
+from lerobot_datasets import write_dataset
 from recordings import write_mcap
 from robots import urdf
-from studio_client import Client, write_swim
+from studio_client import Client, write_spring, write_swim
 
 FULL = {
     "model": "arm.urdf",
@@ -112,6 +112,12 @@ def test_identify_takes_a_project_and_options_besides_win(folder):
     assert (found["method"], found["seed"], other["seed"]) == ("ols", 3, 5)
     assert found["parameters"]["mass"] == pytest.approx(50.0, rel=1e-3)
     assert "leave_out" in json.dumps(found["logs"])
+
+
+def test_two_projects_at_once_are_refused_in_a_sentence(folder):
+    done = run("identify", "--config", "a.toml", "--config=b.toml")
+    assert done.exit_code == 2
+    assert "--config is given twice" in done.stderr
 
 
 def test_the_python_of_a_project_does_what_its_command_does(folder):
@@ -219,6 +225,16 @@ def test_folders_are_those_that_were_given(tmp_path):
     assert [x["name"] for x in nested] == ["y.csv", "a/x.csv"]
 
 
+def test_a_dataset_is_one_log_of_which_the_first_episode_is_shown(tmp_path):
+    angles = np.sin(0.1 * np.arange(100.0))[:, None] * [1.0, 2.0]
+    write_dataset(tmp_path / "in" / "arm", [{"observation.state": angles}] * 2)
+    for folders in (Folders([tmp_path / "in"]), Folders([tmp_path / "in/arm"])):
+        assert [x["name"] for x in folders.listed()["logs"]] == ["arm"]
+    assert Folders([tmp_path / "in/arm"]).files == (tmp_path / "in/arm",)
+    shown = Logs().read(folders.find("arm"), {}).facts()
+    assert "the first of 2 episodes is shown" in shown["notes"][0]
+
+
 def test_a_browser_leaves_the_usual_port_out():
     assert hosts_of(8000) == ["127.0.0.1:8000", "localhost:8000"]
     assert "localhost" in hosts_of(80)
@@ -299,12 +315,7 @@ def test_a_solve_goes_from_start_to_a_report_and_an_export(folder):
 
 
 def test_terms_that_a_model_lacks_are_shown_and_added_by_a_click(folder):
-    t = np.arange(300) * 0.01
-    columns = swim(t)
-    columns["thrust"] = columns["thrust"] + 40.0 * columns["x"]
-    noise = 0.001 * np.random.default_rng(0).standard_normal((2, 300))
-    columns |= {"x": columns["x"] + noise[0], "x_dot": columns["x_dot"] + noise[1]}
-    dr.Log.from_arrays(t, {n: columns[n] for n in ("x", "x_dot", "thrust")}).write("spring.csv")
+    write_spring(folder / "spring.csv")
     client = Client(folder)
     try:
         client.post("api/project", {"model": "underwater-vehicle", "logs": ["spring.csv"], "fix": {"bias": 2.0}})
@@ -313,8 +324,14 @@ def test_terms_that_a_model_lacks_are_shown_and_added_by_a_click(folder):
         shown = client.get("api/result?name=diransac-results/model.json").json()
         assert len(shown["changes"]) == len(shown["suggestions"]) > 0
         assert "x" in shown["changes"][0]
-        client.post("api/project", {"with-suggestions": True})
-        assert "--with-suggestions" in client.studio.state()["commands"]["solve"]["shell"]
+        name = shown["suggestions"][0]["parameter"]
+        client.post("api/project", {"add-terms": [name]})
+        assert f"--add-terms {name}" in client.studio.state()["commands"]["solve"]["shell"]
+        assert f"with_suggestions=['{name}']" in client.studio.state()["commands"]["solve"]["python"]
+        client.post("api/run", {"kind": "solve"})
+        assert client.finished("solve").status == "done", client.studio.jobs.latest["solve"].error
+        again = client.get("api/result?name=diransac-results/model.json").json()
+        assert set(again["parameters"]) == {*shown["parameters"], name}
     finally:
         client.close()
 
@@ -375,6 +392,27 @@ def test_a_search_that_is_ended_has_the_best_answer_so_far(folder, monkeypatch):
         dr.identify(dr.models.underwater_vehicle(), log)
 
 
+def test_terms_that_nothing_suggests_are_named_and_not_added(folder):
+    words = ["identify", "swim.csv", "--model", "underwater-vehicle", "--fix", "bias=2", "--add-terms", "nothing"]
+    done = run(*words)
+    assert "nothing suggests the terms nothing" in " ".join(done.stdout.split())
+
+
+def test_what_several_logs_can_tell_is_inspected_together(folder):
+    write_swim(folder / "other.csv", 300, 5.0)
+    model, logs = dr.models.underwater_vehicle(), [dr.read_log("swim.csv"), dr.read_log("other.csv")]
+    found = inspect(logs, model)
+    alone = inspect(logs[0], model).fitness.excitation
+    assert [x.n_rows for x in (found, *found.others)] == [len(log) for log in logs]
+    assert any(found.fitness.excitation[name].estimate != x.estimate for name, x in alone.items())
+    words = Project(model="underwater-vehicle", logs=["swim.csv", "other.csv"])
+    shell = lines(words, [])["check"]["shell"]
+    told = json.loads(run(*shlex.split(shell)[1:], "--json").stdout)
+    assert told["others"][0]["source"] == found.others[0].source
+    assert told["fitness"]["excitation"]["mass"]["estimate"] == found.fitness.excitation["mass"].estimate
+    assert found.others[0].source in str(found)
+
+
 def test_inspect_takes_known_parameters(folder):
     log, model = dr.read_log("swim.csv"), dr.models.underwater_vehicle()
     assert set(inspect(log, model, fixed={"mass": 50.0}).fitness.excitation) == set(model.parameters) - {"mass"}
@@ -384,25 +422,77 @@ def test_inspect_takes_known_parameters(folder):
         inspect(log, fixed={"mass": 50.0})
 
 
-def test_the_server_starts_tells_its_address_and_ends_with_its_jobs_by_ctrl_c(folder):
+def is_alive(pid):
+    """Whether a process runs; one that has ended may wait for somebody to ask for its code."""
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="ENDS OF THE STUDIO NOT CHECKED: no /proc here")
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 143), (signal.SIGKILL, -9)]
+)
+def test_the_server_ends_with_its_jobs_and_its_scenes_however_it_is_ended(folder, number, code):
     words = [sys.executable, "-m", "diransac", "studio", "swim.csv", "--port", "0", "--no-browser"]
-    begin = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which a shell's background jobs ignore
+
+    def begin():  # a shell's background jobs ignore it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    Path("own.py").write_text(
+        "import subprocess, time\nfrom pathlib import Path\nchild = subprocess.Popen(['sleep', '60'])\n"
+        "Path('part').write_text(str(child.pid))\nPath('part').rename('pid')\ntime.sleep(60)\n"
+    )
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=begin) as server:
         address = server.stderr.readline().split()[0]
         assert address.startswith("http://127.0.0.1:")
-        with urllib.request.urlopen(address) as answer:
-            assert b"diransac studio" in answer.read()
-        for path, body in (("project", {"model": "underwater-vehicle"}), ("run", {"kind": "solve"})):
-            request = urllib.request.Request(f"{address}api/{path}", json.dumps(body).encode())
+
+        def ask(path, **body):
+            request = urllib.request.Request(f"{address}{path}", json.dumps(body).encode() if body else None)
             request.add_header("content-type", "application/json")
-            urllib.request.urlopen(request).close()
-        listed = Path(f"/proc/{server.pid}/task/{server.pid}/children")
-        jobs = listed.read_text().split() if listed.exists() else []
-        server.send_signal(signal.SIGINT)
-        assert server.wait(10) == 130
-    assert jobs or not Path("/proc/self").exists()
-    time.sleep(0.1)
-    assert not [job for job in jobs if Path(f"/proc/{job}").exists()]
+            with urllib.request.urlopen(request) as answer:
+                return answer.read()
+
+        assert b"diransac studio" in ask("")
+        ask("api/project", model="underwater-vehicle")
+        ask("api/scene")
+        ask("api/project", model="own.py")
+        ask("api/confirm", name="own.py", sha256=json.loads(ask("api/code"))["sha256"])
+        ask("api/run", kind="model")
+        end = time.monotonic() + 20.0
+        while time.monotonic() < end and not Path("pid").exists():
+            time.sleep(0.02)
+        of_threads = Path(f"/proc/{server.pid}/task").glob("*/children")
+        started = [Path("pid").read_text(), *(child for x in of_threads for child in x.read_text().split())]
+        server.send_signal(number)
+        assert server.wait(10) == code
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end and any(map(is_alive, started)):
+        time.sleep(0.02)
+    assert len(started) >= 3
+    assert not [process for process in started if is_alive(process)]
+
+
+def test_a_browser_is_given_a_private_file_and_not_the_token(folder, monkeypatch):
+    from diransac.cli.commands import studio
+
+    given = []
+
+    def serve(_files, _port, tell):
+        tell("http://127.0.0.1:8710/t0k3n/")
+        for _ in range(100):
+            if given:
+                break
+            time.sleep(0.02)
+        file = Path(urllib.request.url2pathname(given[0].removeprefix("file://")))
+        assert "t0k3n" in file.read_text()
+        assert (file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+        given.append(file)
+
+    monkeypatch.setattr("diransac.studio.serve", serve)
+    monkeypatch.setattr(studio.webbrowser, "open", given.append)
+    assert run("studio").exit_code == 0
+    assert "t0k3n" not in given[0]
+    assert not given[1].exists()
 
 
 def test_a_taken_port_is_said(folder):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
-from studio_client import write_swim
+from studio_client import write_spring, write_swim
 
 exceptions = pytest.importorskip("selenium.common.exceptions", reason="STUDIO NOT LOOKED AT: selenium is missing")
 StaleElementReferenceException = exceptions.StaleElementReferenceException
@@ -224,6 +224,32 @@ def test_text_of_files_stays_text_and_is_mapped_by_a_drop(page, server):
     assert not page.complaints()
     page.go("data")
     page.click("main button", "Clear")
+
+
+def test_a_suggested_term_is_added_by_a_click_and_taken_back_by_another(page, server):
+    write_spring(server.folder / "spring.csv")
+    page.open(server.address)
+    page.choose("role of spring.csv", "logs")
+    for name in ("swim.csv", "odd.csv"):
+        page.choose(f"role of {name}", "")
+    page.go("model")
+    page.click(".list button", "underwater-vehicle")
+    page.wait("input[aria-label*='bias']").send_keys("2", webdriver.Keys.TAB)
+    page.wait("footer code", "underwater")
+    page.go("solve")
+    page.click("main button", "Solve")
+    page.click("main a", "See the results")
+    page.click("main tr button", "Add and solve again")
+    page.wait("h2", "Solve")
+    chip = page.wait(".chip", "✕")
+    term = chip.text.split()[0]
+    page.click("main a", "See the results")
+    page.wait("main th", term)
+    page.go("solve")
+    page.click(".chip", "✕")
+    page.wait("footer code", "identify")
+    assert "add-terms" not in (server.folder / "project.diransac.toml").read_text()
+    assert not page.complaints()
 
 
 def test_a_bad_file_is_said_in_a_sentence(page, server):

@@ -253,6 +253,29 @@ def test_code_too_long_to_be_shown_is_not_confirmed(client, tmp_path):
         assert client.post("api/confirm", {"name": "own.py", "sha256": ""}).status == 400
 
 
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"# -*- coding: latin-1 -*-\nx = '\xe9'\r", "x = '\u00e9'\n"),
+        (b"\xef\xbb\xbfx = '\xc3\xa9'", "x = '\u00e9'"),
+        (b"# coding: utf-7\n+AG8-pen('ran')", "\nopen('ran')"),
+        (b"# coding: rot13\n", ""),
+        (b"# coding: nothing\n", ""),
+        (b"x = '\xe9'", ""),
+    ],
+)
+def test_code_is_shown_as_python_reads_it_and_otherwise_not_confirmed(client, tmp_path, content, said):
+    (tmp_path / "given/own.py").write_bytes(content)
+    client.post("api/project", {"model": "own.py"})
+    answer = client.get("api/code")
+    if said:
+        assert said in answer.json()["text"]
+        assert answer.json()["sha256"] == hashlib.sha256(content).hexdigest()
+    else:
+        assert b"Python cannot read own.py" in answer.body
+        assert client.studio.code() == ("own.py", "")
+
+
 def test_a_pipe_in_place_of_code_is_not_waited_for(client, tmp_path):
     os.mkfifo(tmp_path / "given/pipe.py")
     client.post("api/project", {"model": "pipe.py"})

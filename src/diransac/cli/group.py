@@ -117,9 +117,12 @@ class Group(TyperGroup):
 
 def _configured(words: list[str]) -> list[str]:
     """Words of ``identify`` with the options of its project file in place of ``--config FILE``, before those given."""
-    at = next((k for k, word in enumerate(words) if word.partition("=")[0] == _CONFIG), None)
-    if at is None or words[0] != "identify":
+    places = [k for k, word in enumerate(words) if word.partition("=")[0] == _CONFIG]
+    if not places or words[0] != "identify":
         return words
+    if len(places) > 1:
+        raise typer.BadParameter(f"{_CONFIG} is given twice; one project has all logs and options")
+    (at,) = places
     _, equals, joined = words[at].partition("=")
     rest = words[at + 1 :] if equals else words[at + 2 :]
     name = joined if equals else next(iter(words[at + 1 :]), "")

@@ -43,22 +43,22 @@ class Gridded:
     notes: tuple[str, ...] = ()
 
 
-def in_order(time: FloatArray, source: str) -> IntArray:
-    """Rows in the order of their stamps ``(N,)``, of several with one stamp the first.
+def in_order(time: FloatArray, source: str) -> IntArray | slice:
+    """Rows in the order of their stamps ``(N,)``, of several with one stamp the first; all as they are by a slice.
 
     Raises LogError: stamps are not finite, or more than a few are repeated or run backwards.
     """
     n = len(time)
     if n < 2 or not np.isfinite(time).all():
         checks.check_time_order(time, source)
-    steps = np.diff(time)
-    if steps.min() > 0.0:
+    shortest, _ = checks.shortest_and_longest(time)
+    if shortest > 0.0:
         checks.check_time_order(time, source)
-        return np.arange(n)
+        return slice(None)
     rows = np.argsort(time, kind="stable")
     rows = rows[np.r_[True, np.diff(time[rows]) > 0.0]]
     usual = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 0.0
-    if len(rows) < 2 or steps.min() < -3.5 * usual or _are_many(n - len(rows), n):
+    if len(rows) < 2 or shortest < -3.5 * usual or _are_many(n - len(rows), n):
         checks.check_time_order(time, source)
     return rows
 
@@ -85,7 +85,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     """
     if is_even(time):
         return Gridded(time, signals, np.ones(len(time), bool))
-    rows = in_order(time, source)
+    rows: IntArray = np.arange(len(time))[in_order(time, source)]
     dt = float(np.median(np.diff(time[rows])))
     with np.errstate(over="ignore"):
         n_new = float(time[rows[-1]] - time[rows[0]]) / dt

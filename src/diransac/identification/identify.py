@@ -48,7 +48,7 @@ def identify(
     start: Mapping[str, float] | None = None,
     horizon: float | None = None,
     compare_logs: bool = True,
-    with_suggestions: bool = False,
+    with_suggestions: bool | Iterable[str] = False,
     time_limit: float | None = None,
     progress: Callback | None = None,
 ) -> Result:
@@ -98,9 +98,10 @@ def identify(
         several, from the time scales of the motion.
     compare_logs : bool, optional
         Whether each of several logs is also identified alone, so that logs that disagree with the others are named.
-    with_suggestions : bool, optional
+    with_suggestions : bool or iterable of str, optional
         Whether to identify again with the terms that the first identification suggests (`Result.suggestions`), and to
-        return that result, whose model has them as further parameters; for lo-diransac.
+        return that result, whose model has them as further parameters; for lo-diransac.  Names of such parameters:
+        with these alone, in steps where a term is suggested only once another one is there.
     time_limit : float, optional
         Time after which the search ends, s; the result is then the best that was found, and a finding says so.  What
         follows the search - intervals, evaluation - takes its time in addition.
@@ -145,7 +146,7 @@ def identify(
     task = _Task(known, given, chosen, int(seed), hold, compares=compare_logs and len(given) > 1)
     with time_limited(time_limit), numerical_failures(given):
         if with_suggestions:
-            return task.with_suggestions(progress)
+            return task.with_suggestions(None if with_suggestions is True else set(with_suggestions), progress)
         if not filtered:
             return task.run(given, progress)
         derived = tuple(preprocessing.differentiate(log, model, bandwidth) for log in given)
@@ -326,20 +327,28 @@ class _Task:
         used, notes = usable_sensors(free, logs, regression=self.method.regresses(free))
         return self.known.of_model(self.known.model.with_sensors(used)), notes
 
-    def with_suggestions(self, progress: Callback | None) -> Result:
-        """The result of the model with the terms that a first identification suggests; its notes name them."""
-        found = self.run(self.given, within(progress, 0.0, 0.5))
-        note = "no terms were suggested; the model is the given one"
-        if found.suggestions:
-            terms = "; ".join(x.text for x in found.suggestions)
-            extended = with_terms(found.model, found.suggestions)
-            task = dataclasses.replace(self, known=self.known.of_model(extended))
+    def with_suggestions(self, wanted: set[str] | None, progress: Callback | None) -> Result:
+        """The result of the model with wanted terms that identifications suggest, of the first one's all for None.
+
+        Its notes name them.
+        """
+        found, task, done, notes = self.run(self.given, within(progress, 0.0, 0.5)), self, 0.5, list[str]()
+        while chosen := [x for x in found.suggestions if wanted is None or x.parameter in wanted]:
+            terms = "; ".join(x.text for x in chosen)
+            wanted = (wanted or set()) - {x.parameter for x in chosen}
+            task = dataclasses.replace(task, known=task.known.of_model(with_terms(found.model, chosen)))
+            begin, done = done, 0.5 * (1.0 + done) if wanted else 1.0
             try:
-                found = task.run(self.given, within(progress, 0.5, 1.0, "with suggested terms: "))
-                note = f"terms were added to the model as suggested: {terms}"
+                found = task.run(self.given, within(progress, begin, done, "with suggested terms: "))
             except TimeLimitError:
-                note = f"the time limit was reached before suggested terms could be added: {terms}"
-        return dataclasses.replace(found, notes=(note, *found.notes))
+                notes.append(f"the time limit was reached before suggested terms could be added: {terms}")
+                break
+            notes.append(f"terms were added to the model as suggested: {terms}")
+        if wanted:
+            notes.append(f"nothing suggests the terms {', '.join(sorted(wanted))}, which were not added")
+        elif not notes:
+            notes.append("no terms were suggested; the model is the given one")
+        return dataclasses.replace(found, notes=(*notes, *found.notes))
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
         """The result with each parameter's relative change at half and twice the bandwidth of every log."""

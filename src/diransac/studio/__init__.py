@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import signal
 import socket
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ _LOOPBACK = "127.0.0.1"
 
 
 def serve(given: Sequence[Path], port: int, tell: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C.
+    """Serve the page until Ctrl-C, SIGTERM, or the end of the terminal; called by the main thread.
 
     Parameters
     ----------
@@ -63,8 +64,17 @@ def serve(given: Sequence[Path], port: int, tell: Callable[[str], None]) -> None
             studio.changed()
             await super().shutdown(sockets)
 
+    # Another end of this process than Ctrl-C is a tidy one, too, with its jobs; nohup's is none.
+    signal.signal(signal.SIGTERM, _leave)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
     with listening:
         Server(config).run([listening])
+
+
+def _leave(number: int, _frame: object) -> None:
+    """Leave the program, with what its contexts do in the end."""
+    raise SystemExit(128 + number)
 
 
 def _listening(port: int) -> socket.socket:

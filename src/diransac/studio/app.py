@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import io
 import json
+import tokenize
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -126,16 +128,20 @@ class Studio:
             return self.project.code, ""
 
     def code_shown(self) -> tuple[str, str]:
-        """Digest and text of the user's own code, from one reading.
+        """Digest and text of the user's own code, from one reading, in the encoding in which Python reads it.
 
-        Raises LogError, OSError: it is not there; SettingsError: it is too long to be shown.
+        Raises LogError, OSError: it is not there; SettingsError: it is too long to be shown, or no text.
         """
         name = self.project.code
         try:
             content = read_bytes(self.folders.find(name), 4 * _MOST_SHOWN)
         except ValueError:
             content = b"#" * (_MOST_SHOWN + 1)
-        text = content.decode("utf-8", errors="replace")
+        try:
+            encoding, _ = tokenize.detect_encoding(io.BytesIO(content).readline)
+            text = io.TextIOWrapper(io.BytesIO(content), encoding).read()
+        except (SyntaxError, LookupError, UnicodeError) as error:
+            raise SettingsError(f"Python cannot read {name}: {error}") from error
         if len(text) > _MOST_SHOWN:
             raise SettingsError(f"{name} has more than {_MOST_SHOWN:,} characters; move parts of it to other files")
         return hashlib.sha256(content).hexdigest(), text
@@ -159,11 +165,19 @@ class Studio:
         """Read what a page will show first, while a browser starts; errors are told to those who ask for it."""
         import polars  # noqa: F401  # which reads logs
 
-        from diransac.model import library  # noqa: F401  # which the list of models takes
-
         with suppress(DiransacError, OSError):
             for name in self.project.logs[:1]:
                 self.shown(name)
+        self.listed()
+
+    def listed(self) -> dict[str, Any]:
+        """Logs and models that may be chosen."""
+        from diransac.model.library import BUILTIN
+
+        found = self.folders.listed()
+        for kind in ("logs", "models"):
+            found[kind] = [x for x in found[kind] if not x["name"].startswith(RESULTS)]
+        return {**found, "builtin": list(BUILTIN)}
 
     def check_files(self, project: Project) -> None:
         """Raise LogError, ModelError: a file of a project is not below the folders that were given."""
@@ -244,12 +258,7 @@ async def _events(studio: Studio, _request: Request) -> Response:
 
 
 async def _files(studio: Studio, _request: Request) -> Response:
-    from diransac.model.library import BUILTIN
-
-    found = await run_in_threadpool(studio.folders.listed)
-    for kind in ("logs", "models"):
-        found[kind] = [x for x in found[kind] if not x["name"].startswith(RESULTS)]
-    return _answer({**found, "builtin": list(BUILTIN)})
+    return _answer(await run_in_threadpool(studio.listed))
 
 
 async def _project(studio: Studio, request: Request) -> Response:

@@ -49,8 +49,7 @@ class Folders:
         absent = next((path for path in paths if not path.exists()), None)
         if absent is not None:
             raise LogError(f'"{absent}" does not exist; give files or folders')
-        is_bag = [path.is_dir() and (path / "metadata.yaml").exists() for path in paths]
-        roots = [path if path.is_dir() and not bag else path.parent for path, bag in zip(paths, is_bag, strict=True)]
+        roots = [path if path.is_dir() and not _is_recording(path) else path.parent for path in paths]
         self.roots = tuple(dict.fromkeys(roots)) or (Path(os.path.realpath(Path.cwd())),)
         self.files = tuple(path for path, root in zip(paths, roots, strict=True) if path != root)
         """Files that were named one by one, which are the first logs of a project."""
@@ -119,13 +118,13 @@ class Folders:
         return {**found, "more": n > _MOST}
 
     def _walked(self) -> Iterator[tuple[Path, bool]]:
-        """Files that may be logs or models; a folder with a bag is a log."""
+        """Files that may be logs or models; a folder with a recording is a log."""
         for root in self.roots:
             if any(root != other and root.is_relative_to(other) for other in self.roots):
                 continue  # what is in it is in the other
             for place, folders, files in os.walk(root):
                 folder = Path(place)
-                if "metadata.yaml" in files and folder != root:
+                if folder != root and _is_recording(folder):
                     folders[:] = []
                     yield folder, True
                     continue
@@ -139,6 +138,11 @@ class Folders:
     def _is_inside(self, path: Path) -> bool:
         real = Path(os.path.realpath(path))
         return real.is_file() and self._holds(real)
+
+
+def _is_recording(folder: Path) -> bool:
+    """True for a folder with a ROS 2 bag or a LeRobot dataset, which is one log."""
+    return (folder / "metadata.yaml").is_file() or (folder / "meta/info.json").is_file()
 
 
 def _taken_in(file: Path, label: str) -> list[str]:

@@ -77,6 +77,8 @@ class Jobs:
     def __init__(self, folder: Path, changed: Callable[[], None]) -> None:
         self._folder, self._changed, self._count = folder, changed, 0
         self._tasks, self._one_at_a_time = set[asyncio.Task[None]](), asyncio.Lock()
+        # A pipe that nothing is written to: commands end when this process, which has its other end, is no more.
+        self._held: Sequence[int] = os.pipe() if hasattr(os, "killpg") else ()
         self.latest = dict[str, Job]()
 
     async def start(self, kind: str, words: Sequence[str], *, as_json: bool = True, confirmed: str = "") -> Job:
@@ -100,9 +102,10 @@ class Jobs:
         async with self._one_at_a_time:
             await self.stop(kind, at_once=True)
             more = ["--json", "--progress-json"] if as_json else []
+            program = ["diransac.cli.attached", str(self._held[0])] if self._held else ["diransac"]
             # Paths are given by the words alone: no module beside the logs is imported.
             process = await asyncio.create_subprocess_exec(
-                *[sys.executable, "-P", "-m", "diransac", *words, *more],
+                *[sys.executable, "-P", "-m", *program, *words, *more],
                 cwd=self._folder,
                 env={**os.environ, "PYTHONSAFEPATH": "1", CONFIRMED: confirmed},
                 stdin=asyncio.subprocess.PIPE,
@@ -110,6 +113,7 @@ class Jobs:
                 stderr=asyncio.subprocess.PIPE,
                 limit=_LONGEST_LINE,
                 start_new_session=True,
+                pass_fds=self._held[:1],
             )
             self._count += 1
             job = self.latest[kind] = Job(list(words), self._count, process=process)
@@ -138,6 +142,9 @@ class Jobs:
         """Kill every job."""
         for kind in self.latest:
             await self.stop(kind, at_once=True)
+        for channel in self._held:
+            os.close(channel)
+        self._held = ()
 
     async def _follow(self, job: Job, *, as_json: bool) -> None:
         """Take what a command writes until it ends."""

@@ -30,9 +30,9 @@ _STEPS = ["from", "until", "while", "leave-out", "despike", "shift"]
 _ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base"]
 _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
-    *("with-suggestions", "time-limit", "differentiate", "bandwidth"),
+    *("with-suggestions", "add-terms", "time-limit", "differentiate", "bandwidth"),
 ]
-_LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies"}
+_LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies", "add-terms"}
 """Options whose value is one text with commas."""
 _DESCRIPTIONS = (".xml", ".mjcf", ".urdf")
 
@@ -84,6 +84,7 @@ class Project(BaseModel):
     horizon: _Number | None = None
     settings: dict[_Text, bool | int | _Number | _Text] = {}
     with_suggestions: bool = False
+    add_terms: list[_Text] = []
     time_limit: _Number | None = None
     differentiate: bool = False
     bandwidth: _Number | None = None
@@ -210,7 +211,7 @@ class Project(BaseModel):
         return [f"model = dr.models.builtin({_quoted(self.model)})"]
 
     def _python_of_search(self, options: Mapping[str, Any]) -> list[str]:
-        named = {"fix": "fixed", "prior": "priors"}
+        named = {"fix": "fixed", "prior": "priors", "add-terms": "with_suggestions"}
         given = {named.get(k, k.replace("-", "_")): options[k] for k in _SEARCH if k in options and k != "method"}
         settings, method, lines = given.pop("settings", None), options.get("method"), list[str]()
         given["fixed"] = {n: None if x == "nominal" else x for n, x in given.get("fixed", {}).items()} or None

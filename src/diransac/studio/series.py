@@ -6,7 +6,7 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.data.log import Log
-from diransac.data.readers import read_log, read_topics
+from diransac.data.readers import episodes_of, read_log, read_topics
 from diransac.errors import LogError
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ class Shown:
     _blocks: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     _outliers: dict[str, IntArray] = field(default_factory=dict)
     _continuous: Mapping[str, FloatArray] = field(default_factory=dict)
+    _alone: threading.Lock = field(default_factory=threading.Lock)
 
     def facts(self) -> dict[str, Any]:
         """Names, units, rows, clock, and findings of the reader."""
@@ -105,12 +106,13 @@ class Shown:
         log = self.log
         if len(log) > _MOST_SCANNED:
             return np.zeros(0), np.zeros(0), -1
-        if name not in self._outliers:
-            self._continuous = self._continuous or preprocessing.unwrap(log).signals
-            known = np.flatnonzero(np.isfinite(self._continuous[name]))
-            with np.errstate(over="ignore", invalid="ignore"):
-                marked = preprocessing.hampel(self._continuous[name][known])[0] if len(known) > 3 else known < 0
-            self._outliers[name] = known[marked]
+        with self._alone:  # a view that moves on asks again while the first search goes on
+            if name not in self._outliers:
+                self._continuous = self._continuous or preprocessing.unwrap(log).signals
+                known = np.flatnonzero(np.isfinite(self._continuous[name]))
+                with np.errstate(over="ignore", invalid="ignore"):
+                    marked = preprocessing.hampel(self._continuous[name][known])[0] if len(known) > 3 else known < 0
+                self._outliers[name] = known[marked]
         rows = self._outliers[name]
         inside = rows[(log.time[rows] >= begin) & (log.time[rows] <= end)]
         thinned = inside[:: 1 + len(inside) // _MOST_MARKED]
@@ -214,13 +216,15 @@ def _read_fields(path: Path, labels: list[str]) -> Log:
 
 
 def _read(path: Path, reading: Mapping[str, Any]) -> Log:
-    """A log; resampled where it is uneven, with a note."""
+    """A log; the first of several episodes, and resampled where it is uneven, with a note."""
+    episodes = episodes_of(path)
+    first = episodes[0] if episodes else None
+    said = [f"the first of {len(episodes)} episodes is shown"] if len(episodes) > 1 else []
     try:
-        return read_log(path, **reading)
+        log = read_log(path, episode=first, **reading)
     except LogError as error:
         if "resample" in reading:
             raise
-        log = read_log(path, **reading, resample="median")
-        from dataclasses import replace
-
-        return replace(log, notes=(f"resampled, because: {error}", *log.notes))
+        log = read_log(path, episode=first, **reading, resample="median")
+        said.append(f"resampled, because: {error}")
+    return replace(log, notes=(*said, *log.notes)) if said else log

@@ -56,6 +56,10 @@ def _log(project: Project, given: Mapping[str, Any]) -> str:
     return f"./{name}" if name.startswith("-") else name
 
 
+def _logs(project: Project) -> list[str]:
+    return [_log(project, {"log": name}) for name in project.logs] or [_log(project, {})]
+
+
 def _solved(results: Sequence[str]) -> list[str]:
     if not results:
         raise SettingsError("there is no result yet; solve first")
@@ -134,9 +138,9 @@ def _map(project: Project, given: Mapping[str, Any], _results: Sequence[str]) ->
     return ["map", _log(project, given), "--model", *_model(project)]
 
 
-def _check(project: Project, given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
+def _check(project: Project, _given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
     reading, known = project.words_of_reading(), project.words_of_fixing()
-    return ["inspect", _log(project, given), *reading, "--model", *_model(project), *known]
+    return ["inspect", *_logs(project), *reading, "--model", *_model(project), *known]
 
 
 _COMMANDS: dict[str, Callable[[Project, Mapping[str, Any], Sequence[str]], list[str]]] = {
@@ -165,7 +169,7 @@ def lines(project: Project, results: Sequence[str]) -> dict[str, dict[str, str]]
     """
     found = results or [_MODEL]
     shell: dict[str, Callable[[], list[str]]] = {
-        "data": lambda: ["inspect", _log(project, {}), *project.words_of_reading()],
+        "data": lambda: ["inspect", *_logs(project), *project.words_of_reading()],
         "model": lambda: command("model", project, {}, found),
         "check": lambda: command("check", project, {}, found),
         "solve": lambda: ["identify", *project.words()],
@@ -186,9 +190,9 @@ def _python(project: Project, result: str) -> dict[str, str]:
     known = {name: None if value == "nominal" else float(value) for name, value in project.fix.items()}
     fixed = f", fixed={known!r}" if known else ""
     parts = {
-        "data": [*first, _INSPECT, *logs, printed("inspect(logs[0])")],
+        "data": [*first, _INSPECT, *logs, printed("inspect(logs)")],
         "model": [*first, *model, printed("model")],
-        "check": [*first, _INSPECT, *model, *logs, printed(f"inspect(logs[0], model{fixed})")],
+        "check": [*first, _INSPECT, *model, *logs, printed(f"inspect(logs, model{fixed})")],
         "solve": whole,
         "results": [*load, held_out, printed("dr.validate(result, held_out)")],
         "use": [*load, "result.export('dynamics.c')", "draws = result.sample(1000)"],

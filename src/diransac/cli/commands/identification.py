@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import model_file, preparation_of, start_values
+from diransac.cli.arguments import model_file, names, preparation_of, start_values
 from diransac.cli.comparison import compare_methods
 from diransac.cli.group import grouped
 from diransac.cli.options import (
@@ -49,6 +49,10 @@ def _identify(
     with_suggestions: Annotated[
         bool, typer.Option("--with-suggestions", help="Identify again with the terms that the model seems to lack.")
     ] = False,
+    add_terms: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="The same with these alone of the terms, by their parameters."),
+    ] = None,
     rough: Annotated[
         str | None,
         typer.Option(
@@ -72,7 +76,8 @@ def _identify(
 ) -> None:
     """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
-    aims = {"start": start_values("--start", rough), "horizon": horizon, "with_suggestions": with_suggestions}
+    terms = names(add_terms or "") or with_suggestions
+    aims = {"start": start_values("--start", rough), "horizon": horizon, "with_suggestions": terms}
     read = [*files, model_file(model), search.settings]
     if each.asked():
         if output or strict:

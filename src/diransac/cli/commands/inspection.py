@@ -14,6 +14,7 @@ from diransac.cli.options import (
     FixedParameters,
     JsonFlag,
     LogFile,
+    LogFiles,
     ModelName,
     OptionalModelName,
     Preparation,
@@ -32,20 +33,21 @@ app = typer.Typer(add_completion=False)
 @app.command("inspect")
 @grouped
 def _inspect(
-    file: LogFile,
+    files: LogFiles,
     preparation: Preparation,
     robot: RobotOptions,
     model: OptionalModelName = None,
     fixed: FixedParameters = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Show what a log holds, what is odd about it, and what is missing for a model."""
+    """Show what logs hold, what is odd about them, and what is missing for a model."""
     plant = None if model is None else robot.load(model)
     like = preparation_of(model)
-    topics = read_topics(file)
+    topics = next(filter(None, map(read_topics, files)), None)
     if topics is None or preparation.names_signals or any(step["step"] == "map" for step in like):
         known = fixed_parameters("--fix", fixed or ())
-        screen.show(inspect(preparation.read_uneven(file, like), plant, fixed=known), as_json)
+        logs = [preparation.read_uneven(file, like) for file in files]
+        screen.show(inspect(logs, plant, fixed=known), as_json)
     else:
         screen.show(Recorded.of(topics, plant), as_json)
 

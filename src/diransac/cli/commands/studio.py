@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 import webbrowser
 from pathlib import Path
@@ -25,10 +26,16 @@ def _studio(
     """Open a page on this machine that leads from logs to a calibrated model; Ctrl-C ends it."""
     from diransac.studio import serve
 
-    def tell(address: str) -> None:
-        screen.note(f"{address}  (Ctrl-C ends it)")
-        if not no_browser:
-            # A browser of the terminal would hold the server up.
-            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    with tempfile.TemporaryDirectory() as private:
 
-    serve(files or [], port, tell)
+        def tell(address: str) -> None:
+            screen.note(f"{address}  (Ctrl-C ends it)")
+            if not no_browser:
+                # Everybody may see a browser's arguments: it is given a file of this user alone, not the token.
+                file = Path(private, "studio.html")
+                file.touch(0o600)
+                file.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={address}">')
+                # A browser of the terminal would hold the server up.
+                threading.Thread(target=webbrowser.open, args=(file.as_uri(),), daemon=True).start()
+
+        serve(files or [], port, tell)

@@ -86,10 +86,12 @@ def is_numeric(kind: pl.DataType) -> bool:
 
 
 def numbers_of(series: pl.Series) -> FloatArray:
-    """Numbers of a column, null as NaN."""
+    """Numbers of a column, null as NaN; read-only, so that a log takes them as they are."""
     import polars as pl
 
-    return series.cast(pl.Float64).fill_null(np.nan).to_numpy().astype(np.float64)
+    numbers = np.concatenate([part.to_numpy() for part in series.cast(pl.Float64).fill_null(np.nan).get_chunks()])
+    numbers.flags.writeable = False
+    return numbers
 
 
 def _seconds(series: pl.Series) -> FloatArray | None:

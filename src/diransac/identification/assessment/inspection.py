@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
-from diransac.data.dataset import Dataset, usable_sensors
+from diransac.data.dataset import Dataset, as_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.data.segment import spelling_notes
 from diransac.errors import IdentificationError, LogError, SettingsError
@@ -26,6 +26,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
 from diransac.identification.structure.structural import structural
 from diransac.model import Model
+from diransac.model.parameter import Parameter
 from diransac.text_table import aligned, percent
 
 
@@ -61,7 +62,7 @@ class SignalFacts:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Ordinary least-squares estimate of a parameter from the whole log, outliers included, and its relative error.
+    """Ordinary least-squares estimate of a parameter from whole logs, outliers included, and its relative error.
 
     Parameters
     ----------
@@ -118,6 +119,8 @@ class Fitness:
 class Inspection:
     """Statistics of a log, returned by `inspect`; printed as a table.
 
+    Of several logs, those of the first one, with the fitness of all together.
+
     Parameters
     ----------
     source : str
@@ -134,6 +137,8 @@ class Inspection:
         Suitability for a model; None where no model was given.
     events : mapping of str to float
         Part of the rows in which each event of the mapping holds.
+    others : tuple of Inspection
+        Of the further logs.
     """
 
     source: str
@@ -144,6 +149,7 @@ class Inspection:
     notes: tuple[str, ...]
     fitness: Fitness | None = None
     events: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    others: tuple[Inspection, ...] = ()
 
     @property
     def duration(self) -> float:
@@ -156,15 +162,19 @@ class Inspection:
         if self.fitness is not None:
             verdicts = {name: found.verdict for name, found in self.fitness.excitation.items()}
             facts["fitness"]["verdicts"] = verdicts
-        return facts
+        return facts | {"others": [x.to_dict() for x in self.others]}
 
     def __str__(self) -> str:
+        logs = "\n\n".join("\n".join(x._signal_lines()) for x in (self, *self.others))
+        return "\n".join([logs, *self._fitness_lines()])
+
+    def _signal_lines(self) -> list[str]:
         end = self.start + self.duration
         head = f"{self.source}: {self.n_rows} rows at {1.0 / self.dt:.6g} Hz, {self.start:.6g} to {end:.6g} s"
         rows = [["signal", "unit", "minimum", "maximum", "std", "Hz", "NaN", "spikes", "frozen s"]]
         rows += [[name, *_cells(facts)] for name, facts in self.signals.items()]
         held = [f"  event {n}: holds in {percent(x)} of the rows" for n, x in self.events.items()]
-        return "\n".join([head, *aligned(rows), *held, *(f"  {note}" for note in self.notes), *self._fitness_lines()])
+        return [head, *aligned(rows), *held, *(f"  {note}" for note in self.notes)]
 
     def _fitness_lines(self) -> list[str]:
         found = self.fitness
@@ -185,15 +195,18 @@ class Inspection:
 
 
 def inspect(
-    log: Log, model: Model | None = None, *, fixed: Mapping[str, float | None] | Iterable[str] | None = None
+    logs: Log | Iterable[Log],
+    model: Model | None = None,
+    *,
+    fixed: Mapping[str, float | None] | Iterable[str] | None = None,
 ) -> Inspection:
-    """Statistics of a log, and the identifiability of a model's parameters from it.
+    """Statistics of logs, and the identifiability of a model's parameters from all of them together.
 
     Parameters
     ----------
-    log : Log
+    logs : Log or iterable of Log
     model : Model, optional
-        Velocities and accelerations that the model needs and the log lacks are derived, where they can be.
+        Velocities and accelerations that the model needs and the logs lack are derived, where they can be.
     fixed : mapping of str to float, or iterable of str, optional
         Parameters of the model that are known, as in `identify`.
 
@@ -204,21 +217,28 @@ def inspect(
     Raises
     ------
     SettingsError
-        The model has no such parameter, or one is fixed without a model.
+        There is no log; the model has no such parameter, or one is fixed without a model.
     """
     if model is None and fixed:
         raise SettingsError("parameters are fixed without a model; give the model, too")
-    model = None if model is None else KnownParameters.of(model, fixed, None).free()
+    several, model = as_logs(logs), None if model is None else KnownParameters.of(model, fixed, None).free()
+    first, *others = (_contents(log, model) for log in several)
+    fitness = None if model is None else _fitness(several, model)
+    if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
+        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, several))
+        spiked = _caveat([first, *others], model)
+        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, spiked])))
+    return dataclasses.replace(first, fitness=fitness, others=tuple(others))
+
+
+def _contents(log: Log, model: Model | None) -> Inspection:
+    """Statistics of one log."""
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
-    fitness = None if model is None else _fitness(log, model)
-    if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
-        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, [log]))
-        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, _caveat(signals, model)])))
     like = () if model is None else spelling_notes(model, log, (*model.signals, *model.inputs))
     notes = (*log.notes, *like)
-    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, fitness, events)
+    return Inspection(log.source, len(log), float(log.time[0]), log.dt, signals, notes, events=events)
 
 
 def _events(log: Log) -> list[str]:
@@ -266,10 +286,10 @@ def _cells(facts: SignalFacts) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- a model
 
 
-def _fitness(log: Log, model: Model) -> Fitness:
-    missing = tuple(name for name in model.required_signals if name not in log)
-    derived = _derived(log, model) if missing else log
-    derivable = tuple(name for name in missing if name in derived)
+def _fitness(logs: Sequence[Log], model: Model) -> Fitness:
+    missing = tuple(name for name in model.required_signals if any(name not in log for log in logs))
+    derived = [_derived(log, model) for log in logs] if missing else logs
+    derivable = tuple(name for name in missing if all(name in log for log in derived))
     excitation, reason = dict[str, Excitation](), ""
     if derivable != missing:
         later = "lo-diransac estimates them; excitation is known only after identification"
@@ -282,18 +302,20 @@ def _fitness(log: Log, model: Model) -> Fitness:
             excitation, reason = _excitation(model, derived)
         except (LogError, IdentificationError) as error:
             reason = str(error)
-    return Fitness(model.name, missing, derivable, excitation, reason, bases=_bases(log, model))
+    return Fitness(model.name, missing, derivable, excitation, reason, bases=_bases(logs, model))
 
 
-def _bases(log: Log, model: Model) -> dict[str, str]:
-    """Rates by name -> the coordinate that they are derivatives of, where the log lacks it."""
-    chains = [chain for chain in model.chains if chain[0] in model.coordinates and chain[0] not in log]
+def _bases(logs: Sequence[Log], model: Model) -> dict[str, str]:
+    """Rates by name -> the coordinate that they are derivatives of, where a log lacks it."""
+    lacking = {name for name in model.coordinates if any(name not in log for log in logs)}
+    chains = [chain for chain in model.chains if chain[0] in lacking]
     return {name: chain[0] for chain in chains for name in chain[1:]}
 
 
-def _caveat(signals: Mapping[str, SignalFacts], model: Model) -> str:
+def _caveat(logs: Sequence[Inspection], model: Model) -> str:
     """A warning of spikes in the signals of the equations; empty without them."""
-    spiked = [name for name in model.required_signals if name in signals and signals[name].n_spikes]
+    having = {name for log in logs for name, facts in log.signals.items() if facts.n_spikes}
+    spiked = [name for name in model.required_signals if name in having]
     if not spiked:
         return ""
     return f"spikes in {', '.join(spiked)} bias these estimates and errors: pass --despike, or use those of identify"
@@ -307,32 +329,33 @@ def _derived(log: Log, model: Model) -> Log:
         return log
 
 
-def _not_excited(ambiguous: Sequence[Ambiguity], model: Model) -> dict[str, Excitation]:
+def _not_excited(ambiguous: Sequence[Ambiguity], parameters: Mapping[str, Parameter]) -> dict[str, Excitation]:
     """Excitation of parameters that are not identifiable."""
     names = [name for x in ambiguous for name in x.names]
-    return {name: Excitation(model.parameters[name].unit, np.nan, np.inf) for name in names}
+    return {name: Excitation(parameters[name].unit, np.nan, np.inf) for name in names}
 
 
-def _excitation(model: Model, log: Log) -> tuple[dict[str, Excitation], str]:
+def _excitation(model: Model, logs: Sequence[Log]) -> tuple[dict[str, Excitation], str]:
     """Excitation of each parameter; where some are not identifiable, of those alone, with the reason.
 
     Raises LogError, IdentificationError: nothing can be identified from the log, or it cannot be scored.
     """
-    model = model.with_sensors(usable_sensors(model, [log], regression=True)[0])
-    dataset = Dataset.of(model, log)
+    model = model.with_sensors(usable_sensors(model, logs, regression=True)[0])
+    dataset = Dataset.of(model, logs)
     check_motion(dataset)
     ambiguous = structural(model, ranges=dataset.ranges)
     if ambiguous:
-        return _not_excited(ambiguous, model), "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
-    bound = OrdinaryLeastSquares().bind(dataset)
+        return _not_excited(ambiguous, model.parameters), "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
+    bound, layout = OrdinaryLeastSquares().bind(dataset), dataset.layout
+    own = dict(zip(layout.names, layout.bounds, strict=True))
     rows = np.arange(bound.n_rows)
     selected = bound.select([rows])
     if not selected.well_defined()[0]:
-        ambiguous = of_log(list(model.parameters), bound.null_space())
-        return _not_excited(ambiguous, model), in_words(ambiguous, 1)
+        ambiguous = of_log(list(own), bound.null_space())
+        return _not_excited(ambiguous, own), in_words(ambiguous, len(logs))
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(errors), np.inf), where=estimates != 0.0)
     choose_scoring(dataset, Settings())
-    rated = zip(model.parameters.items(), estimates.tolist(), relative.tolist(), strict=True)
+    rated = zip(own.items(), estimates.tolist(), relative.tolist(), strict=True)
     return {name: Excitation(parameter.unit, x, error) for (name, parameter), x, error in rated}, ""

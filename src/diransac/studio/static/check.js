@@ -33,14 +33,22 @@ export const check = (root, now) => {
   put(
     root,
     h("h2", "Check"),
-    h("p.how", "Signals, excitation, and the intervals to expect, by least squares over the first log."),
+    h("p.how", "Signals, excitation, and the intervals to expect, by least squares over the chosen logs."),
     status,
     about,
     design,
     designed,
   );
+  const lack = (title, text) =>
+    h(".card.bad", h("h3", title), h("p", text), toStage("data", "Choose their columns in Data"));
   const drawFound = () => {
-    const { fitness, signals } = found,
+    if (!found.signals) {
+      put(about, lack("No topic is mapped to a signal yet", found.source));
+      found = null;
+      return;
+    }
+    const { fitness } = found,
+      logs = [found, ...found.others],
       lacking = fitness.missing.filter((x) => !fitness.derivable.includes(x));
     const rows = Object.entries(fitness.excitation).map(([name, x]) => {
       const [words, look] = WORDS[fitness.verdicts[name]],
@@ -58,13 +66,7 @@ export const check = (root, now) => {
     });
     put(
       about,
-      lacking.length > 0 &&
-        h(
-          ".card.bad",
-          h("h3", "The log lacks signals"),
-          h("p", lacking.join(", ")),
-          toStage("data", "Choose their columns in Data"),
-        ),
+      lacking.length > 0 && lack("Signals are lacking", lacking.join(", ")),
       fitness.derivable.length > 0 &&
         h("p", `Not measured, estimated where it is needed: ${fitness.derivable.join(", ")}.`),
       fitness.reason &&
@@ -76,22 +78,24 @@ export const check = (root, now) => {
       rows.length > 0 &&
         table(["parameter", "least squares", "interval to expect", "unit", "error", ""], rows),
       fitness.caveat && h("p.how", fitness.caveat),
-      h("h3", "Signals"),
-      notes(found.notes),
-      table(
-        ["signal", "unit", "minimum", "maximum", "std", "Hz", "missing", "spikes", "frozen"],
-        Object.entries(signals).map(([name, x]) => [
-          name,
-          x.unit || "?",
-          number(x.minimum),
-          number(x.maximum),
-          number(x.standard_deviation),
-          number(x.rate),
-          String(x.n_missing || "–"),
-          String(x.n_spikes || "–"),
-          x.frozen ? `${number(x.frozen, 3)} s` : "–",
-        ]),
-      ),
+      logs.map((log) => [
+        h("h3", logs.length > 1 ? `Signals of ${log.source}` : "Signals"),
+        notes(log.notes),
+        table(
+          ["signal", "unit", "minimum", "maximum", "std", "Hz", "missing", "spikes", "frozen"],
+          Object.entries(log.signals).map(([name, x]) => [
+            name,
+            x.unit || "?",
+            number(x.minimum),
+            number(x.maximum),
+            number(x.standard_deviation),
+            number(x.rate),
+            String(x.n_missing || "–"),
+            String(x.n_spikes || "–"),
+            x.frozen ? `${number(x.frozen, 3)} s` : "–",
+          ]),
+        ),
+      ]),
     );
   };
   const drawDesign = async (state) => {
@@ -105,9 +109,11 @@ export const check = (root, now) => {
       const units = { ...equations.signals, ...equations.inputs },
         names = Object.keys(equations.signals).filter((name) => !isRate(name));
       for (const name of [...Object.keys(equations.inputs), ...names]) {
-        const x = found?.signals[name];
-        if (x && x.maximum > x.minimum && units[name] !== "1")
-          limits[name] = [x.minimum, x.maximum].map((y) => Number(y.toPrecision(3)));
+        const ranges = found ? [found, ...found.others].map((log) => log.signals[name]).filter(Boolean) : [],
+          least = Math.min(...ranges.map((x) => x.minimum)),
+          most = Math.max(...ranges.map((x) => x.maximum));
+        if (most > least && units[name] !== "1")
+          limits[name] = [least, most].map((y) => Number(y.toPrecision(3)));
       }
     }
     const field = (name, k) =>
@@ -129,7 +135,7 @@ export const check = (root, now) => {
       h("h3", "The experiment that would tell more"),
       h(
         "p.how",
-        "A motion within limits from which the parameters are identified best. The limits are the ranges of the log, or those of the robot's description.",
+        "A motion within limits from which the parameters are identified best. The limits are the ranges of the logs, or those of the robot's description.",
       ),
       !state.robot &&
         h(

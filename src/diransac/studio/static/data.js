@@ -69,6 +69,7 @@ export const data = (root, now) => {
       if (key === x) lists[x] = [...rest, name];
       else if (rest.length < (project()[x] || []).length) lists[x] = rest;
     }
+    Object.assign(project(), lists); // for the next choice, which may come before the server's word on this one
     change(lists);
     if (key) open(name);
   };
@@ -113,7 +114,9 @@ export const data = (root, now) => {
       facts = found;
       const names = facts.signals.map((x) => x.name);
       chosen = new Set([...chosen].filter((x) => names.includes(x)));
-      if (!chosen.size) names.slice(0, 6).forEach((x) => chosen.add(x));
+      // Stamps of messages are no signals, and come first.
+      const telling = names.filter((x) => !/\.stamp\b/.test(x));
+      if (!chosen.size) (telling.length ? telling : names).slice(0, 6).forEach((x) => chosen.add(x));
       plotted.hidden = false;
       drawLog();
     } catch (error) {
@@ -217,7 +220,7 @@ export const data = (root, now) => {
     const row = ([signal, unit]) => {
       const from =
         map[signal] || (!facts.raw && has.has(signal) ? signal : columns.includes(signal) ? signal : "");
-      const state = from ? "✓" : isRate(signal) ? "derived" : "missing";
+      const lacking = isRate(signal) ? "derived" : "missing";
       const drop = {
         ondragover: (event) => {
           event.preventDefault();
@@ -230,7 +233,7 @@ export const data = (root, now) => {
           assign(signal, event.dataTransfer.getData("text/plain"));
         },
       };
-      const options = [["", "–"], ...(from && !columns.includes(from) ? [from] : []), ...columns];
+      const options = [["", lacking], ...(from && !columns.includes(from) ? [from] : []), ...columns];
       return h(
         "tr",
         drop,
@@ -239,10 +242,10 @@ export const data = (root, now) => {
           "td",
           choice(from, options, (column) => assign(signal, column), {
             "aria-label": `column of ${signal}`,
+            className: from || lacking === "derived" ? "" : "is-bad",
             disabled: Boolean(file_),
           }),
         ),
-        h(state === "missing" ? "td.is-bad" : "td.how", state),
       );
     };
     put(

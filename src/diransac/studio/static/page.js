@@ -72,13 +72,13 @@ export const number = (x, digits = 4) => {
   if (x === null || x === undefined || Number.isNaN(x)) return "–";
   const text =
     Math.abs(x) >= 1e5 || (x !== 0 && Math.abs(x) < 1e-3)
-      ? x.toExponential(digits - 1)
+      ? x.toExponential(digits - 1).replace(/\.?0+e/, "e")
       : String(+x.toPrecision(digits));
   return text.replace(/-/g, "−");
 };
 // A table whose rows begin with a heading; columns have names where a header is given.
 export const table = (header, rows) => {
-  const cell = (x) => h(typeof x === "string" && /^[−\d–]/.test(x) ? "td.number" : "td", x);
+  const cell = (x) => h(typeof x === "string" && (/^[−\d–]/.test(x) || x.length < 16) ? "td.number" : "td", x);
   const row = ([name, ...cells]) => h("tr", h("th", { scope: "row" }, name), cells.map(cell));
   const columns = header?.map((x) => h("th", { scope: "col" }, x));
   return h(".scroll", h("table", columns && h("thead", h("tr", columns)), h("tbody", rows.map(row))));

@@ -173,7 +173,12 @@ export class Plots {
     Object.assign(shown, found);
     const { plot, count, lines, marks } = shown;
     if (found.total)
-      put(count, found.total > 0 ? `${found.total} outliers` : "too long to be searched for outliers");
+      put(
+        count,
+        found.total > 0
+          ? `${found.total} outlier${found.total > 1 ? "s" : ""}`
+          : "too long to be searched for outliers",
+      );
     plot.setData(marks ? this.marked(lines, marks) : [...lines, lines[0].map(() => null)]);
   }
 

@@ -84,8 +84,10 @@ export const results = (root, now) => {
       run("solve");
       location.hash = "solve";
     };
-    const addTerms = async () => {
-      if ((await change({ "with-suggestions": true })) && (await run("solve"))) location.hash = "solve";
+    const addTerms = async (names) => {
+      const terms = [...new Set([...(now().project["add-terms"] || []), ...names])];
+      if ((await change({ "add-terms": terms, "with-suggestions": null })) && (await run("solve")))
+        location.hash = "solve";
     };
     put(
       pick,
@@ -143,16 +145,21 @@ export const results = (root, now) => {
           "div",
           h("h3", "Terms that the model seems to lack"),
           table(
-            ["term", "coefficient", "unit", "explains", "change of the model"],
+            ["term", "coefficient", "unit", "explains", "change of the model", ""],
             found.suggestions.map((x, k) => [
               x.name || x.kind,
               `${number(x.value)} ± ${number(x.standard_error, 2)}`,
               x.unit,
               `${Math.round(100 * x.explained)} %`,
               h("code", found.changes[k]),
+              button("Add and solve again", () => addTerms([x.parameter])),
             ]),
           ),
-          h(".row", button("Add these terms and solve again", addTerms)),
+          found.suggestions.length > 1 &&
+            h(
+              ".row",
+              button("Add all and solve again", () => addTerms(found.suggestions.map((x) => x.parameter))),
+            ),
         ),
       found.competition &&
         h(

@@ -47,7 +47,8 @@ export const solve = (root, now) => {
   );
   const drawOptions = ({ project }) => {
     if (unchanged(options, project)) return;
-    const method = project.method || METHODS[0];
+    const method = project.method || METHODS[0],
+      terms = project["add-terms"] || [];
     const field = (name, label, placeholder) => {
       const set = (text) => change({ [name]: text === "" ? null : Number(text) });
       return h("label", label, numberField(project[name], set, { min: 0, placeholder }));
@@ -77,6 +78,17 @@ export const solve = (root, now) => {
         tick("with-suggestions", "and again with the terms it suggests"),
         method !== METHODS[0] && tick("differentiate", "differentiate what is not measured"),
       ),
+      terms.length > 0 &&
+        h(
+          ".row",
+          h("span.how", "Terms to add, once they are suggested:"),
+          terms.map((name) =>
+            button(`${name}  ✕`, () => change({ "add-terms": terms.filter((x) => x !== name) }), {
+              className: "chip",
+              title: "take it back",
+            }),
+          ),
+        ),
     );
   };
   const drawLive = (job) => {
@@ -112,7 +124,7 @@ export const solve = (root, now) => {
         ),
       note && h("p", note.note),
       h(
-        ".columns",
+        ".columns.even",
         best &&
           h(
             "div",
