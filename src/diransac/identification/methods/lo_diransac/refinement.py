@@ -418,12 +418,13 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
                 least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
-                return Step(there, trial, step.of_fit, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
+                solved = step.of_fit if damping == 0.0 else at.step(at.right).of_fit
+                return Step(there, trial, solved, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
             if not more < _CORRECTED * excess:
                 break
             right, excess = at.corrected(there, fit, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return Step(intervals, fit, step.of_fit, damping, 0.0)
+    return Step(intervals, fit, at.step(at.right).of_fit, damping, 0.0)
 
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
