@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
+from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, JointStep
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -375,19 +376,27 @@ class Step:
     intervals : ShootingIntervals
     fit : Fit
         After the step.
-    solved : Factored
-        Its solution.
-    damping : float
-        Of the next step.
+    at : JointEquations
+        Before it.
+    taken : JointStep
+    damped, damping : float
+        Of this step and of the next.
     of_errors : float
         Largest change of an error of the recordings over its standard error.
     """
 
     intervals: ShootingIntervals
     fit: Fit
-    solved: Factored
+    at: JointEquations
+    taken: JointStep
+    damped: float
     damping: float
     of_errors: float
+
+    @cached_property
+    def solved(self) -> Factored:
+        """Solution without damping, which is no information: scales and standard errors follow from it."""
+        return (self.at.step(self.at.right) if self.damped else self.taken).of_fit
 
 
 def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> Step:
@@ -418,13 +427,13 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
                 least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
-                solved = step.of_fit if damping == 0.0 else at.step(at.right).of_fit
-                return Step(there, trial, solved, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
+                of_errors = float((np.abs(step.sizes) / step.std).max(initial=0.0))
+                return Step(there, trial, at, step, damping, least, of_errors)
             if not more < _CORRECTED * excess:
                 break
             right, excess = at.corrected(there, fit, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return Step(intervals, fit, at.step(at.right).of_fit, damping, 0.0)
+    return Step(intervals, fit, at, step, damping, damping, 0.0)
 
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
