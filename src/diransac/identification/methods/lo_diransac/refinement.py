@@ -416,7 +416,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
     """
     weights = at.of_fit.weights
     before = cost(intervals, fit, weights)
-    for _ in range(_MAX_TRIALS):
+    for trials in range(_MAX_TRIALS):
         right, excess = at.right, np.inf
         while True:
             step = at.step(right, damping)
@@ -426,7 +426,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             trial = _moved(there, fit, step.of_fit)
             more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
-                least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
                 of_errors = float((np.abs(step.sizes) / step.std).max(initial=0.0))
                 return Step(there, trial, at, step, damping, least, of_errors)
             if not more < _CORRECTED * excess:
