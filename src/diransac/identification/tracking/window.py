@@ -271,9 +271,7 @@ class Window:
             at = linearized(intervals, self.fit, weights)
             before = self.fit
             taken = gauss_newton_step(intervals, before, at, damping)
-            # Damping is no information.
-            solved = at.step(at.right).of_fit if damping or taken.damping else taken.solved
-            damping = taken.damping
+            solved, damping = taken.solved, taken.damping
             self.last = Linearization(intervals, before, at.of_fit, solved)
             self.fit = self._with_scales(intervals, taken.fit, solved)
             first = first or self.last

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
+from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, JointStep
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -375,19 +376,27 @@ class Step:
     intervals : ShootingIntervals
     fit : Fit
         After the step.
-    solved : Factored
-        Its solution.
-    damping : float
-        Of the next step.
+    at : JointEquations
+        Before it.
+    taken : JointStep
+    damped, damping : float
+        Of this step and of the next.
     of_errors : float
         Largest change of an error of the recordings over its standard error.
     """
 
     intervals: ShootingIntervals
     fit: Fit
-    solved: Factored
+    at: JointEquations
+    taken: JointStep
+    damped: float
     damping: float
     of_errors: float
+
+    @cached_property
+    def solved(self) -> Factored:
+        """Solution without damping, which is no information: scales and standard errors follow from it."""
+        return (self.at.step(self.at.right) if self.damped else self.taken).of_fit
 
 
 def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> Step:
@@ -407,7 +416,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
     """
     weights = at.of_fit.weights
     before = cost(intervals, fit, weights)
-    for _ in range(_MAX_TRIALS):
+    for trials in range(_MAX_TRIALS):
         right, excess = at.right, np.inf
         while True:
             step = at.step(right, damping)
@@ -417,13 +426,17 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             trial = _moved(there, fit, step.of_fit)
             more = cost(there, trial, weights) - before
             if more <= 1e-9 * before:
-                least = damping / 10.0 if damping > _LEAST_DAMPING else 0.0
-                return Step(there, trial, step.of_fit, least, float((np.abs(step.sizes) / step.std).max(initial=0.0)))
+                least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                of_errors = float((np.abs(step.sizes) / step.std).max(initial=0.0))
+                return Step(there, trial, at, step, damping, least, of_errors)
             if not more < _CORRECTED * excess:
                 break
-            right, excess = at.corrected(there, fit, trial, step), more
+            curvature, jumps = at.curvature(there, fit, trial, step), trial.jumps(there)
+            if (at.of_fit.precision * curvature * (2.0 * jumps - curvature)).sum() < more:
+                break  # With ends that are not curved, the cost would have risen, too.
+            right, excess = at.corrected(there, curvature), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return Step(intervals, fit, step.of_fit, damping, 0.0)
+    return Step(intervals, fit, at, step, damping, damping, 0.0)
 
 
 def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:

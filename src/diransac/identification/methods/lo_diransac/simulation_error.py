@@ -316,7 +316,7 @@ class _Solution:
 
     def _stepped(self, damping: float) -> tuple[_Solution | None, float, float]:
         """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
-        intervals = self.segments.intervals
+        intervals, least = self.segments.intervals, max(0.1 * damping, _DAMPING_BOUNDS[0])
         while damping <= _DAMPING_BOUNDS[1]:
             parts, following = self._reduced(damping)
             matrix, gradient = _with_priors(intervals, self.parameters, parts)
@@ -325,8 +325,8 @@ class _Solution:
             then = replace(self, parameters=p, states=self.states - following @ np.append(change, 1.0))
             if then.cost < self.cost:
                 sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
-                return then, float(sizes.max()), max(0.1 * damping, _DAMPING_BOUNDS[0])
-            damping *= 10.0
+                return then, float(sizes.max()), least
+            damping = least = 10.0 * damping
         return None, 0.0, damping
 
     def grown(self, length: int) -> _Solution:
