@@ -367,22 +367,7 @@ class JointEquations:
         possible = all(is_possible(intervals, kind, x) for kind, x in sizes.items())
         return intervals.corrected(sizes, self.rates) if possible else None
 
-    def curvature(self, intervals: ShootingIntervals, fit: Fit, moved: Fit, step: JointStep) -> FloatArray:
-        """Jumps ``(W - 1, n_x)`` after a step, less those that these equations expect; 0 where a log or a gap ends.
-
-        Parameters
-        ----------
-        intervals : ShootingIntervals
-        fit : Fit
-            Of these equations.
-        moved : Fit
-            After the step, in which no rollout diverges.
-        step : JointStep
-        """
-        curved = self.of_fit.excess(intervals, fit, moved) - self.jumps @ step.sizes
-        return np.where(intervals.linked[:, None], curved, 0.0)
-
-    def corrected(self, intervals: ShootingIntervals, curvature: FloatArray) -> Right:
+    def corrected(self, intervals: ShootingIntervals, fit: Fit, moved: Fit, step: JointStep) -> Right:
         """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
 
         Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
@@ -391,16 +376,22 @@ class JointEquations:
         Parameters
         ----------
         intervals : ShootingIntervals
-        curvature : (W - 1, n_x) array
-            Result of `curvature`.
+        fit : Fit
+            Of these equations.
+        moved : Fit
+            After the other step.
+        step : JointStep
+            That step.
 
         Returns
         -------
         (W, k) array, (n_s,) array, (E,) array
+            Not finite where a rollout diverges.
         """
         at = self.of_fit
-        of_z, of_s = at.by_jumps(intervals, curvature)
-        of_e = np.einsum("wi,wi,wie->e", at.precision, curvature, self.jumps)
+        more = at.excess(intervals, fit, moved) - self.jumps @ step.sizes
+        of_z, of_s = at.by_jumps(intervals, more)
+        of_e = np.einsum("wi,wi,wie->e", at.precision, np.where(intervals.linked[:, None], more, 0.0), self.jumps)
         right_z, right_s, right_e = self.right
         return right_z - of_z, right_s - of_s, right_e - of_e
 

@@ -431,10 +431,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
                 return Step(there, trial, at, step, damping, least, of_errors)
             if not more < _CORRECTED * excess:
                 break
-            curvature, jumps = at.curvature(there, fit, trial, step), trial.jumps(there)
-            if (at.of_fit.precision * curvature * (2.0 * jumps - curvature)).sum() < more:
-                break  # With ends that are not curved, the cost would have risen, too.
-            right, excess = at.corrected(there, curvature), more
+            right, excess = at.corrected(there, fit, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return Step(intervals, fit, at, step, damping, damping, 0.0)
 
