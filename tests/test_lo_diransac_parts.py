@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
-from diransac.identification.methods.lo_diransac import integration_steps
+from diransac.identification.methods.lo_diransac import integration_steps, refinement
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
@@ -447,6 +447,27 @@ def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts(late):
     assert kept < 0.01 * broken
     assert (weights * np.square(corrected.residuals)).sum() < 1.1 * (weights * np.square(plain.residuals)).sum()
     assert kept < best
+
+
+@pytest.mark.parametrize(("n_failures", "begin", "damped", "following"), [(0, 1e-3, 1e-3, 1e-4), (2, 1e-5, 1e-3, 1e-3)])
+def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_without_it(
+    n_failures, begin, damped, following, monkeypatch
+):
+    intervals, signals = intervals_of(n_rows=200)
+    fit = with_residuals(intervals, perturbed_fit(intervals, signals))
+    at = JointEquations.of(intervals, fit, ())
+    weights, failures = at.of_fit.weights, iter(n_failures * [True])
+    before = cost(intervals, fit, weights)
+
+    def failing(there, trial, weights):
+        return cost(there, trial, weights) if trial is fit or not next(failures, False) else before + 1.0
+
+    monkeypatch.setattr(refinement, "_CORRECTED", 0.0)
+    monkeypatch.setattr(refinement, "cost", failing)
+    step = refinement.gauss_newton_step(intervals, fit, at, begin)
+    assert cost(step.intervals, step.fit, weights) < before
+    np.testing.assert_allclose([step.damped, step.damping], [damped, following])
+    np.testing.assert_array_equal(step.solved.var_p, at.step(at.right).of_fit.var_p)
 
 
 def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():
