@@ -435,8 +435,9 @@ def is_alive(pid):
 def test_the_server_ends_with_its_jobs_and_its_scenes_however_it_is_ended(folder, number, code):
     words = [sys.executable, "-m", "diransac", "studio", "swim.csv", "--port", "0", "--no-browser"]
 
-    def begin():  # a shell's background jobs ignore it
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    def begin():  # a shell's background jobs ignore them
+        for ignored in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(ignored, signal.SIG_DFL)
 
     Path("own.py").write_text(
         "import subprocess, time\nfrom pathlib import Path\nchild = subprocess.Popen(['sleep', '60'])\n"
@@ -464,7 +465,10 @@ def test_the_server_ends_with_its_jobs_and_its_scenes_however_it_is_ended(folder
         of_threads = Path(f"/proc/{server.pid}/task").glob("*/children")
         started = [Path("pid").read_text(), *(child for x in of_threads for child in x.read_text().split())]
         server.send_signal(number)
-        assert server.wait(10) == code
+        try:
+            assert server.wait(10) == code
+        finally:
+            server.kill()
     end = time.monotonic() + 5.0
     while time.monotonic() < end and any(map(is_alive, started)):
         time.sleep(0.02)
