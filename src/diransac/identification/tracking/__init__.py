@@ -7,8 +7,9 @@
 | `stream.py` | samples on the grid of their clock; gaps, restarts, late and repeated ones; sensors that stop |
 | `starting.py` | the problem, the first window, and a start by the default method |
 | `window.py` | the fit of the last intervals, and what remains of those before |
-| `changes.py` | steps and drifts of parameters: tested, released, reported |
-| `step_tests.py`, `forces.py` | their tests; unmodelled forces that explain as much |
+| `changes.py` | steps and drifts of parameters: tested, compared, released, reported |
+| `step_tests.py`, `forces.py` | their tests; larger unmodelled forces |
+| `stepped_fits.py` | fits of a window with a step, and with larger forces instead |
 | `surprise.py` | outliers where a machine may have changed |
 """
 

@@ -14,11 +14,13 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.tracking.estimates import Change
-from diransac.identification.tracking.forces import explanations_by_forces, with_forces
+from diransac.identification.tracking.forces import Forces, likeliest_forces, with_forces
 from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
+from diransac.identification.tracking.stepped_fits import SteppedFit, SteppedFits
+from diransac.identification.tracking.window import AS_LIKELY
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import ParameterLayout
+    from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.window import Linearization, Window
 
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 _MEMORY = 60.0
 # Ages that are tested at most: those of a window of 2^30 intervals.
 _MOST_AGES = 32
+# Time after which unmodelled accelerations that explain a window clearly better than any step are usual ones, s.
+_PATIENCE = 1.0
 # Standard deviations of the changes by a drift in a second, over the size of a parameter.
 _RATES = np.concatenate([[0.0], np.logspace(-6.0, -1.0, 16)])
 # Evidence, nats, from which on a parameter drifts, or a change counts that no force has been asked to explain.
@@ -40,47 +44,6 @@ class _Pending:
     time: float
     before: float
     before_error: float
-
-
-@dataclass(frozen=True)
-class _Explanation:
-    """Changes of some parameters at a time that explain a window.
-
-    Parameters
-    ----------
-    evidence : float
-        nats
-    tests : ChangeTests
-        Of the window with some unmodelled forces.
-    age : int
-        Place of the age.
-    chosen : (n,) bool array
-        Parameters that change; none of a ramp, which is no step.
-    """
-
-    evidence: float
-    tests: ChangeTests
-    age: int
-    chosen: BoolArray
-
-
-def _explanation(
-    tests: ChangeTests, values: FloatArray, scatter: FloatArray, evidence: float, layout: ParameterLayout
-) -> _Explanation:
-    """The likeliest change, beside the evidence of a window without any; one to outside the bounds explains nothing."""
-    single = tests.gain(values, scatter)
-    single[0][~np.stack([layout.admits(values + x * np.eye(len(x))) for x in tests.size[0]])] = 0.0
-    of_steps, chosen = tests.steps_at_once(values, scatter[0])
-    for age, few in enumerate(chosen):
-        changed = values.copy()
-        changed[few] += tests.sizes(age, few)
-        if layout.violations(changed):
-            best = int(np.argmax(single[0, age]))
-            of_steps[age], chosen[age] = single[0, age, best], np.arange(len(values)) == best
-    age, of_ramp = int(np.argmax(of_steps)), float(single[1].max())
-    if of_ramp > of_steps[age]:
-        return _Explanation(evidence + of_ramp, tests, age, np.zeros(len(values), bool))
-    return _Explanation(evidence + float(of_steps[age]), tests, age, chosen[age])
 
 
 class Drift:
@@ -205,13 +168,16 @@ class Changes:
         self.drift = Drift(self.names, drift)
         shape = (2, _MOST_AGES, len(self.names))
         self._squares, self._counts = np.zeros(shape), np.zeros(shape)
-        self._learned = 0.0
+        self._learned, self._rest, self._firing = 0.0, 0, 0
         self._usual: FloatArray | None = None
         self._doubt = Doubt(len(self.names))
         self._before = np.full(len(self.names), np.inf)
         self._anchor, self._since = np.zeros((2, len(self.names))), np.zeros(len(self.names))
         self._is_said = np.zeros(len(self.names), bool)
         self._pending: list[_Pending] = []
+        # What was known where the window begins with a change, as long as that may turn out to be none.
+        self._kept: BoundaryPrior | None = None
+        self._is_sure = False
         self._reported: list[Change] = []
         self._new: list[Change] = []
 
@@ -221,7 +187,8 @@ class Changes:
 
     def after_step(self, window: Window, found: Linearization) -> None:
         """Test for changes, release a parameter that has changed, and report what is determined."""
-        of_calm = with_forces(found, *self._usual_forces(window))
+        usual = self._usual_forces(window)
+        of_calm = with_forces(found, usual)
         is_full = len(window) == window.most
         tests = change_tests(of_calm, self._ages(window))
         gain = tests.gain(window.fit.shared, self._scatter(tests.ages, len(window))).max()
@@ -234,8 +201,12 @@ class Changes:
         fires = gain > self._price(tests.ages)
         if is_full and not (fires and calibrated):
             self._learn_scatter(tests)
-        if calibrated and fires:
-            self._decide(window, of_calm)
+        self._rest -= 1
+        self._firing = self._firing + 1 if fires else 0
+        if is_full and self._kept is not None:
+            self._is_sure, self._kept = True, None
+        if calibrated and (fires or self._kept is not None) and self._rest < 0:
+            self._decide(window, usual)
         self._report(window)
         self._follow_drift(window)
 
@@ -244,8 +215,8 @@ class Changes:
         n = len(window)
         return ages(n) if n == window.most else np.array([n])
 
-    def _usual_forces(self, window: Window) -> tuple[FloatArray, FloatArray]:
-        """Size and correlation ``(n_v,)`` of the unmodelled accelerations from before the window.
+    def _usual_forces(self, window: Window) -> Forces:
+        """Unmodelled accelerations from before the window.
 
         They follow those of the fit with a delay of a window, so that a change which unmodelled accelerations seem to
         explain is tested against those that the machine usually has.
@@ -253,7 +224,7 @@ class Changes:
         now = np.stack([np.log(window.fit.tau), window.fit.rho])
         self._usual = now if self._usual is None else self._usual
         self._usual = self._usual + min(1.0, self.step / self._duration(window)) * (now - self._usual)
-        return np.exp(self._usual[0]), self._usual[1]
+        return Forces(np.broadcast_to(np.exp(self._usual[0]), window.fit.d.shape), self._usual[1])
 
     def _duration(self, window: Window) -> float:
         """Duration of the window, s."""
@@ -295,34 +266,74 @@ class Changes:
 
     # ------------------------------------------------------------------ a change
 
-    def _decide(self, window: Window, found: Linearization) -> None:
-        """Release the parameter that has changed from then on, unless forces or a drift explain as much."""
-        best: _Explanation | None = None
-        without = -np.inf
+    def _decide(self, window: Window, usual: Forces) -> None:
+        """Release the parameters that have changed from then on, unless forces or a drift explain as much."""
+        fits = SteppedFits(window, self._kept)
+        calm = with_forces(fits.motion, usual)
         values, ages = window.fit.shared, self._ages(window, fine_ages_of)
-        scatter = self._scatter(ages, len(window))
-        for scaled, evidence in explanations_by_forces(found, window.expected):
-            without = max(without, evidence)
-            one = _explanation(change_tests(scaled, ages), values, scatter, evidence, self._layout)
-            best = one if best is None or one.evidence > best.evidence else best
-        assert best is not None
-        if best.evidence - without < self._price(ages_of(len(window))) or not best.chosen.any():
+        tests, scatter = change_tests(calm, ages), self._scatter(ages, len(window))
+        of_steps, chosen = tests.steps_at_once(values, scatter[0])
+        place = int(np.argmax(of_steps))
+        # What has not been clear is asked again with a quarter more intervals.
+        self._rest = int(ages[place]) // 4
+        if not chosen[place].any():
             return
-        tests, places = best.tests, np.flatnonzero(best.chosen)
-        sizes = tests.sizes(best.age, best.chosen)
-        self._drift_by(window, tests, best)
-        first = len(window) - int(tests.ages[best.age])
-        time = float(window.times[first])
-        before = found.fit.shared + sizes @ tests.shift[0, best.age, places]
-        self._doubt.since(float(np.abs(sizes / before[places]).max()))
-        known = window.release(first, places, before, sizes)
-        self._pending = [x for x in self._pending if x.index not in places]
-        self._pending += [_Pending(int(k), time, *of_it) for k, of_it in zip(places, known, strict=True)]
+        few, first = np.flatnonzero(chosen[place]), len(window) - int(ages[place])
+        sizes, none = tests.sizes(place, chosen[place]), np.zeros_like(window.least)
+        step, forces = fits.nearby(first, few, sizes, usual), usual
+        # A change may have been taken for forces until it is found: the model may be exact with it.
+        exact = Forces(np.broadcast_to(window.least, window.fit.d.shape), none)
+        if (usual.tau > window.expected).any() and fits.stepped(first, few, sizes, exact).evidence > step.evidence:
+            step, forces = fits.nearby(first, few, sizes, exact), exact
+        age = len(window) - step.first
+        larger = likeliest_forces(calm, window.expected, window.spread, {len(window), age, min(age + 1, len(window))})
+        unchanged = {x: fits.unchanged(x) for x in (usual, forces, larger)}
+        without = max(unchanged.values())
+        if step.evidence < without:
+            step, forces = fits.stepped(step.first, few, step.sizes, larger), larger
+        if step.evidence > without:
+            step = fits.simplest(step, forces)
+        clear, scale = AS_LIKELY * len(step.changed), float(scatter[0, place, step.changed].max())
+        over_usual, over_rivals = step.evidence - unchanged[usual], step.evidence - without
+        if over_rivals > clear and over_usual > scale * self._price(ages_of(len(window))):
+            if not self._is_no_step(step, fits.linearized(step)):
+                self._release(window, step, tests.information[0, place, step.changed])
+        elif self._kept is not None and over_rivals < 0.0:
+            window.begin_with(0, fits.stepped(0, few[:0], none[:0], larger).fit)
+            self._pending, self._kept = [], None
+        elif over_rivals < -AS_LIKELY and self._firing * self.step > _PATIENCE:
+            self._usual = np.stack([np.log(larger.tau[-1]), larger.rho])
 
-    def _drift_by(self, window: Window, tests: ChangeTests, change: _Explanation) -> None:
-        """Count steps as those of a drift, which steps that follow one another are."""
-        information = np.where(change.chosen, tests.information[0, change.age], 0.0)
-        self.drift.learn(window.fit.shared, tests.size[0, change.age], information, self._duration(window), 1.0)
+    def _is_no_step(self, step: SteppedFit, after: Linearization) -> bool:
+        """True if parameters change further after a step, or end outside their bounds, or at one."""
+        values, age = step.fit.shared, np.array([len(after.fit.x)])
+        moves = change_tests(after, age).gain(values, self._scatter(age, step.first + int(age[0])))[1].max() > AS_LIKELY
+        return bool(moves or self._layout.violations(values) or self._layout.on_bounds(values)[step.changed].any())
+
+    def _release(self, window: Window, step: SteppedFit, known: FloatArray) -> None:
+        """Begin the window with a step, whose values are reported once it is found again, and they are known.
+
+        Parameters
+        ----------
+        window : Window
+        step : SteppedFit
+        known : (m,) array
+            Inverse variances of its sizes.
+        """
+        if self._kept is not None and not step.first and [x.index for x in self._pending] == step.changed.tolist():
+            self._is_sure = True
+            return
+        # Steps that follow one another are those of a drift.
+        size, information = np.zeros((2, len(self.names)))
+        size[step.changed], information[step.changed] = step.sizes, known
+        self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0)
+        time, before = float(window.times[step.first]), step.before[step.changed]
+        self._doubt.since(float(np.abs(step.sizes / before[:, 0]).max()))
+        window.begin_with(step.first, step.fit)
+        earlier = [x for x in self._pending if self._kept is None and x.index not in step.changed]
+        new = zip(step.changed, before.tolist(), strict=True)
+        self._pending = [*earlier, *(_Pending(int(k), time, *x) for k, x in new)]
+        self._is_sure, self._kept, self._rest = False, step.kept, 0
 
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""
@@ -332,9 +343,10 @@ class Changes:
             after, error = float(window.fit.shared[one.index]), float(errors[one.index])
             change, both = abs(after - one.before), float(np.hypot(error, one.before_error))
             settled = abs(after - self._before[one.index]) < error and not at_bound[one.index]
-            if settled and change > significant * both:
+            if settled and change > significant * both and self._is_sure:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
+                self._kept = None
             elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
                 self._pending.remove(one)
         self._before = window.fit.shared

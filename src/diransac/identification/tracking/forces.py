@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
-# Correlation of unmodelled accelerations that are larger than usual.
+# Correlations of unmodelled accelerations that are larger than usual, and number of their sizes.
 _GUST = 0.9
+_CORRELATIONS, _SIZES = (_GUST, 0.98), 5
 
 
 class _Terms(NamedTuple):
@@ -43,23 +44,36 @@ def _terms(intervals: ShootingIntervals, fit: Fit) -> _Terms:
     )
 
 
-def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linearization:
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Unmodelled accelerations.
+
+    Parameters
+    ----------
+    tau : (n_v,) or (W, n_v) array
+        Their size.
+    rho : (n_v,) array
+        Their correlation from interval to interval.
+    """
+
+    tau: FloatArray
+    rho: FloatArray
+
+
+def with_forces(found: Linearization, forces: Forces) -> Linearization:
     """The linearised window with other scales of the unmodelled accelerations.
 
     Parameters
     ----------
     found : Linearization
-    tau : (n_v,) or (W, n_v) array
-        Their size.
-    rho : (n_v,) array
-        Their correlation from interval to interval.
+    forces : Forces
 
     Returns
     -------
     Linearization
         Its solution is still that of the former scales.
     """
-    at, fit = found.at, replace(found.fit, tau=tau, rho=rho)
+    at, fit = found.at, replace(found.fit, tau=forces.tau, rho=forces.rho)
     old, new, n_x = _terms(found.intervals, found.fit), _terms(found.intervals, fit), fit.x.shape[1]
     diagonal, below, right = at.system.diagonal.copy(), at.system.below.copy(), at.right_z.copy()
     np.einsum("wii->wi", diagonal)[:, n_x:] += new.diagonal - old.diagonal
@@ -69,46 +83,44 @@ def with_forces(found: Linearization, tau: FloatArray, rho: FloatArray) -> Linea
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def explanations_by_forces(found: Linearization, expected: FloatArray) -> Iterator[tuple[Linearization, float]]:
-    """The linearised window with its unmodelled accelerations, and with larger ones, as a gust has, from a time on.
+def likeliest_forces(found: Linearization, least: FloatArray, most: FloatArray, ages: Iterable[int]) -> Forces:
+    """Unmodelled accelerations that explain a linearised window best: its own, or larger ones, as a gust has.
 
-    One after the other becomes larger, as long as the evidence does; that which matters most, by every factor.
+    All become larger from a time on, and then each by itself, as long as the evidence grows.
 
     Parameters
     ----------
     found : Linearization
-    expected : (n_v,) array
-        Size of the unmodelled accelerations of any model.
+    least, most : (n_v,) array
+        Sizes between which they are sought, where its own are not larger.
+    ages : iterable of int
+        Intervals at the end of the window in which they may be larger.
 
-    Yields
-    ------
-    Linearization
-    float
-        Its evidence, nats.
+    Returns
+    -------
+    Forces
     """
-    fit, W = found.fit, len(found.fit.x)
-    usual, least = np.broadcast_to(fit.tau, fit.d.shape), np.maximum(fit.tau, expected)
-    rho = np.maximum(fit.rho, _GUST)
-    best, evidence = usual, _evidence(found)
-    yield found, evidence
-    larger = [
-        np.where((np.arange(W) >= W - age)[:, None], factor * least, usual)
-        for age in (min(8, W), W)
-        for factor in 6.0 ** np.arange(4)
+    W, usual = len(found.fit.x), Forces(np.broadcast_to(found.fit.tau, found.fit.d.shape), found.fit.rho)
+    low = np.maximum(usual.tau, least)
+    sizes = [low * (np.maximum(most, low) / low) ** share for share in np.linspace(0.0, 1.0, _SIZES)]
+    since = [(np.arange(W) >= W - age)[:, None] for age in ages]
+    common = [
+        Forces(np.where(now, tau, usual.tau), np.maximum(usual.rho, rho))
+        for now in since
+        for tau in sizes
+        for rho in _CORRELATIONS
     ]
-    strongest: list[tuple[Linearization, float]] = []
-    most = 0.0
-    for axis in np.eye(len(expected), dtype=bool):
-        trials = [np.where(axis, tau, best) for tau in larger]
-        scaled = [with_forces(found, tau, rho) for tau in trials]
-        evidences = [_evidence(x) for x in scaled]
-        k = int(np.argmax(evidences))
-        if evidences[k] - evidence > most:
-            strongest, most = list(zip(scaled, evidences, strict=True)), evidences[k] - evidence
-        if evidences[k] > evidence:
-            best, evidence = trials[k], evidences[k]
-            yield scaled[k], evidence
-    yield from strongest
+    best, evidence = _likeliest(found, [usual, *common])
+    for axis in np.eye(len(least), dtype=bool):
+        of_axis = [usual.tau, *(np.where(best.tau > usual.tau, tau, usual.tau) for tau in sizes)]
+        trials = [Forces(np.where(axis, tau, best.tau), best.rho) for tau in of_axis]
+        best, evidence = max((best, evidence), _likeliest(found, trials), key=lambda x: x[1])
+    return best
+
+
+def _likeliest(found: Linearization, trials: Sequence[Forces]) -> tuple[Forces, float]:
+    """Those of some unmodelled accelerations with the largest evidence, and that."""
+    return max(((x, _evidence(with_forces(found, x))) for x in trials), key=lambda x: x[1])
 
 
 def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:
@@ -126,11 +138,10 @@ def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArra
         The larger one of the sizes of the fit, where they are larger than the least, and of some others.
     """
     none = np.zeros_like(least)
-    exact = _evidence(with_forces(found, least, none))
-    others = [(expected, none), (30.0 * expected, none + _GUST)]
+    others = [Forces(expected, none), Forces(30.0 * expected, none + _GUST)]
     if (found.fit.tau > least).any():
-        others = [(found.fit.tau, found.fit.rho)]
-    return max(_evidence(with_forces(found, *x)) for x in others) - exact
+        others = [Forces(found.fit.tau, found.fit.rho)]
+    return _likeliest(found, others)[1] - _likeliest(found, [Forces(least, none)])[1]
 
 
 def _evidence(found: Linearization) -> float:

@@ -35,8 +35,6 @@ class ChangeTests:
         Estimated step, and estimated rise of a ramp, of each parameter.
     information : (2, A, n) array
         Inverse variance; 0 where the window does not determine a change.
-    shift : (2, A, n, n) array
-        Change of all parameters before it, per unit of its size.
     of_steps : (A, n, n) array
         Information of steps of all parameters at once.
     """
@@ -44,7 +42,6 @@ class ChangeTests:
     ages: IntArray
     size: FloatArray
     information: FloatArray
-    shift: FloatArray
     of_steps: FloatArray
 
     @property
@@ -185,8 +182,7 @@ def change_tests(found: Linearization, ages: IntArray) -> ChangeTests:
     shape = (2, A, n)
     known = (information[:A] > 0.0).astype(float)
     of_steps *= known[:, :, None] * known[:, None, :]
-    shift = -np.moveaxis(s, 0, -1)
-    return ChangeTests(ages, size.reshape(shape), information.reshape(shape), shift.reshape(*shape, n), of_steps)
+    return ChangeTests(ages, size.reshape(shape), information.reshape(shape), of_steps)
 
 
 def _weights(ages: IntArray, W: int) -> FloatArray:

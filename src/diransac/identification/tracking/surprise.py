@@ -18,12 +18,14 @@ from diransac.identification.methods.lo_diransac.normal_equations import weights
 from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 
 if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.arrowhead import Factored
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.tracking.window import Window
 
 # Standard deviation of parameters that are held, over their values.
 _HELD = 1e-6
+_STEPS = 6
 
 
 def is_surprised(window: Window) -> bool:
@@ -49,14 +51,33 @@ def weights_of_free_motion(window: Window) -> FloatArray:
     (N, n_s) array
     """
     n = min(len(window), round(1.0 / (window.length * window.stream.dt)))
-    whole = window.fit
     rows = slice(-n * window.length, None)
     intervals = window.setup.intervals(window.stream, window.end - n * window.length, n)
+    weights = weights_of(window.intervals(), window.fit)
+    weights[rows] = weights_of(intervals, free_motion(window, intervals, n))
+    return weights
+
+
+def free_motion(window: Window, intervals: ShootingIntervals, n: int) -> Fit:
+    """Fit of the last n intervals of a window that follows their samples, whatever the parameters.
+
+    Parameters
+    ----------
+    window : Window
+    intervals : ShootingIntervals
+        The last n.
+    n : int
+
+    Returns
+    -------
+    Fit
+    """
+    whole = window.fit
     fit = replace(
         whole,
         x=whole.x[-n:],
         d=whole.d[-n:],
-        residuals=whole.residuals[rows],
+        residuals=whole.residuals[-n * window.length :],
         ends=whole.ends[-n:],
         tau=window.spread,
         rho=np.zeros_like(whole.rho),
@@ -64,19 +85,33 @@ def weights_of_free_motion(window: Window) -> FloatArray:
         prior_mean=whole.shared,
         boundary=None,
     )
-    weights = weights_of(window.intervals(), whole)
-    weights[rows] = weights_of(intervals, _followed(intervals, fit))
-    return weights
+    return followed(intervals, fit)[0]
 
 
-def _followed(intervals: ShootingIntervals, fit: Fit) -> Fit:
-    """The fit after some steps, with noise as large as the residuals of each at first: none starts as an outlier."""
+def followed(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, Factored]:
+    """The fit after some steps, with noise as large as the residuals of each at first: none starts as an outlier.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    Fit
+        With the noise that was given.
+    Factored
+        Solution of the last step.
+    """
     usual, damping = fit.noise, 0.0
-    for _ in range(6):
+    for _ in range(_STEPS):
         samples = zip(np.abs(fit.residuals).T, intervals.known.T, strict=True)
         # Three quarters of the samples are no outliers; of a standard normal x, this quantile of |x| is 1.15.
         scale = [np.quantile(x[k], 0.75) / 1.15 if k.any() else 0.0 for x, k in samples]
         fit = replace(fit, noise=replace(usual, sigma=np.maximum(usual.sigma, scale)))
         taken = gauss_newton_step(intervals, fit, linearized(intervals, fit), damping)
+        moved = np.abs(taken.fit.x - fit.x)
         fit, damping = taken.fit, taken.damping
-    return replace(fit, noise=usual)
+        if (moved <= 0.1 * np.sqrt(taken.solved.var_z[:, : moved.shape[1]])).all():
+            break
+    return replace(fit, noise=usual), taken.solved

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
-from diransac.identification.methods.lo_diransac.refinement import bounded, gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
+from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
     SHRINK,
     ProcessSums,
-    effect_on_state,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
@@ -199,65 +198,22 @@ class Window:
             root[changing, np.arange(len(changing))] = std[changing]
             self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
 
-    def release(
-        self, first: int, changed: IntArray, before: FloatArray, sizes: FloatArray
-    ) -> list[tuple[float, float]]:
-        """Begin the window anew where parameters have changed, of which nothing is known from then on.
+    def begin_with(self, first: int, fit: Fit) -> None:
+        """Begin the window with one of its intervals, from a fit of those that follow.
 
         Parameters
         ----------
         first : int
-            Interval with which the change begins.
-        changed : (m,) int array
-            Parameters that change.
-        before : (n_p,) array
-            Parameters before the change.
-        sizes : (m,) array
-            Of the changes.
-
-        Returns
-        -------
-        list of (float, float)
-            Each of these parameters before the change, and its standard error.
+        fit : Fit
+            Of these intervals; scales are those of the window.
         """
         whole = self.fit
-        fit, known = self._fit_before(first, changed, before)
-        shared, rows = fit.shared.copy(), first * self.length
-        shared[changed] += sizes
-        shared = bounded(self.intervals(), fit.shared, shared)
-        assert fit.boundary is not None
-        # The change may be within the interval before or after, whose motion is then that of neither.
-        free = np.concatenate([effect_on_state(self.intervals(), self.spread), self.spread, np.zeros(len(shared))])
-        free[len(free) - len(shared) + changed] = 10.0 * np.maximum(np.abs(shared[changed]), np.abs(sizes))
-        boundary = fit.boundary.diffused(np.diag(free)[:, free > 0.0])
-        self.first, self.times = self.first + rows, self.times[first:]
+        scales = {name: getattr(whole, name) for name in ("tau", "rho", "continuity_std")}
+        self.first, self.times = self.first + first * self.length, self.times[first:]
         # Outliers and forces for which the change was taken until it was found are forgotten.
         self.memory = self._memories[-min(len(self.times) + 1, len(self._memories))]
-        self.fit = replace(whole, shared=shared, x=whole.x[first:], d=whole.d[first:], boundary=boundary)
-        self.fit = with_residuals(self.intervals(), self.fit)
+        self.fit = replace(fit, **scales)
         self.optimise()
-        return known
-
-    def _fit_before(self, first: int, changed: IntArray, before: FloatArray) -> tuple[Fit, list[tuple[float, float]]]:
-        """The fit of the intervals before one of the window, as a boundary of that; parameters and their errors."""
-        if not first:
-            boundary = self.fit.boundary
-            assert boundary is not None
-            found = [boundary.marginal_of(len(boundary.point) - len(before) + int(k)) for k in changed]
-            shared = before.copy()
-            shared[changed] = [mean for mean, _ in found]
-            return replace(self.fit, shared=shared), [(mean, float(np.sqrt(variance))) for mean, variance in found]
-        whole = self.intervals()
-        is_before = np.arange(len(whole.measured)) < first * self.length
-        intervals = replace(whole, sampled=whole.sampled & is_before[:, None])
-        fit, damping = with_residuals(intervals, replace(self.fit, shared=before)), 0.0
-        for _ in range(_MOST_STEPS):
-            at = linearized(intervals, fit)
-            taken = gauss_newton_step(intervals, fit, at, damping)
-            fit, damping = taken.fit, taken.damping
-        boundary = _marginal(linearized(intervals, fit).of_fit, intervals, fit, first)
-        errors = np.sqrt(np.diag(taken.solved.var_p))
-        return replace(fit, boundary=boundary), [(float(fit.shared[k]), float(errors[k])) for k in changed]
 
     # ------------------------------------------------------------------ the fit
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 # Part of the largest eigenvalue, of information that is scaled to a diagonal of one, that rounding leaves of none.
 _ROUNDING = 1e-14
-# Part of an unknown that the information must determine.
-_SURE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -66,19 +64,38 @@ class BoundaryPrior:
         roots, columns = np.sqrt(values[kept]), vectors[:, kept]
         return cls(point, (columns * roots).T / scale, columns.T @ (scale * right) / roots)
 
+    @classmethod
+    def of_covariance(cls, mean: FloatArray, covariance: FloatArray) -> BoundaryPrior:
+        """The Gaussian with a mean ``(n,)`` and a covariance ``(n, n)``."""
+        scale = np.sqrt(np.diag(covariance))
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        roots = 1.0 / np.sqrt(np.maximum(values, _ROUNDING))
+        return cls(mean, (vectors * roots).T / scale, np.zeros(len(mean)))
+
     @property
     def information(self) -> FloatArray:
         """Information matrix ``(n, n)``."""
         return self.root.T @ self.root
 
-    def marginal_of(self, index: int) -> tuple[float, float]:
-        """Mean and variance of one unknown; the variance is infinite where nothing is known of it."""
+    @property
+    def log_det(self) -> float:
+        """Logarithm of the determinant of the information, of what is known at all."""
+        size = np.linalg.norm(self.root, axis=0)
+        values = np.linalg.svd(self.root / np.where(size > 0.0, size, 1.0), compute_uv=False)
+        known = values > np.sqrt(_ROUNDING) * values[0]
+        return float(2.0 * (np.log(values[known]).sum() + np.log(size[size > 0.0]).sum()))
+
+    @property
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean ``(n,)`` and covariance ``(n, n)``; variances are huge where nothing is known."""
         size = np.linalg.norm(self.root, axis=0)
         scale = 1.0 / np.where(size > 0.0, size, 1.0)
-        inverse = scale[:, None] * np.linalg.pinv(self.root * scale)
-        known = float(inverse[index] @ self.root[:, index])
-        variance = float(np.square(inverse[index]).sum()) if known > 1.0 - _SURE else np.inf
-        return float(self.point[index] + inverse[index] @ self.offset), variance
+        _, values, rows = np.linalg.svd(self.root * scale, full_matrices=True)
+        inverse = np.full(len(size), 1.0 / np.sqrt(_ROUNDING))
+        inverse[: len(values)] = 1.0 / np.maximum(values, np.sqrt(_ROUNDING))
+        half = (rows * scale).T * inverse
+        covariance = half @ half.T
+        return self.point + covariance @ (self.root.T @ self.offset), covariance
 
     def right(self, fit: Fit) -> FloatArray:
         """Minus half the gradient of twice the cost, ``(n,)``, at a fit."""

@@ -351,20 +351,40 @@ def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | Non
 
 
 def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> float:
+    """Negative log evidence of a fit at its optimum; infinite where a rollout diverges."""
+    if diverges(fit):
+        return np.inf
+    return negative_log_evidence(intervals, fit, at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s).log_det)
+
+
+def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float) -> float:
     """Negative logarithm of the probability of the measurements by Laplace's method.
 
-    Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum; infinite where
-    a rollout diverges.  Freedom costs: a discrepancy whose prior is wide counts against a fit unless it
-    explains the log better.
+    Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum.  Freedom costs:
+    a discrepancy whose prior is wide counts against a fit unless it explains the log better.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    log_det : float
+        Of its normal equations.
+
+    Returns
+    -------
+    float
+        Infinite where a rollout diverges.
     """
     loss = fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum()
     beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
     if not np.isfinite(loss + beforehand):
         return np.inf
-    solved = at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s)
-    scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(innovation_std(intervals, fit)).sum()
+    std = innovation_std(intervals, fit)
+    scales = intervals.linked.sum() * np.log(fit.continuity_std).sum() + np.log(std[np.isfinite(std)]).sum()
     scales += np.log(fit.prior[np.isfinite(fit.prior)]).sum()
-    return float(loss + 0.5 * beforehand + 0.5 * solved.log_det + scales)
+    if fit.boundary is not None:
+        scales -= 0.5 * fit.boundary.log_det
+    return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
 
 
 @dataclass(frozen=True)
