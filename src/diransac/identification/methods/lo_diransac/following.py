@@ -46,8 +46,8 @@ _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
 _BEGINNING = 8
 """Intervals after the beginning of a log, or a gap, in which what changes a state is the beginning's."""
-_DELAY_STEP = 0.5
-"""Difference of a delay, samples."""
+_DELAY_STEP = 1e-6
+"""Difference of a delay, samples: a wider one meets contacts that begin a step later, which tell nothing of it."""
 
 
 @dataclass(frozen=True)
