@@ -110,6 +110,46 @@ def test_signals_predictions_outliers_inputs_and_forces_are_read_back(identified
 
 
 @needs_rerun
+def test_bodies_are_replayed_as_measured_and_as_predicted(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    text = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/><body name="arm" pos="0 0 1">
+      <joint name="hinge" axis="0 1 0" damping="{d}"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="1"/>
+      <geom type="box" size=".05 .05 .05" pos="0 0 -.4" mass=".5"/></body></worldbody>
+      <actuator><motor name="drive" joint="hinge"/></actuator></mujoco>"""
+    machine = mujoco.MjModel.from_xml_string(text.format(d=0.3))
+    data, time, rng = mujoco.MjData(machine), 0.01 * np.arange(600), np.random.default_rng(0)
+    drive, angle = 2.0 * np.sin(3.0 * time) + np.sin(7.0 * time), np.empty(600)
+    for k, torque in enumerate(drive):
+        angle[k], data.ctrl[0] = data.qpos[0], torque
+        mujoco.mj_step(machine, data)
+    (tmp_path / "arm.xml").write_text(text.format(d=0.1))
+    log = dr.Log.from_arrays(time, {"hinge": angle + 1e-3 * rng.normal(size=600), "drive": drive})
+    model = dr.models.mujoco(tmp_path / "arm.xml", unknown=["joint/hinge.damping"])
+    result = dr.identify(model, log)
+    assert result.parameters["joint/hinge.damping"] == pytest.approx(0.3, rel=0.02)
+    write_recording(result, [log], tmp_path / "arm.rrd")
+
+    from rerun import chunk as chunks
+
+    poses, shapes = {}, set()
+    for chunk in chunks.RrdReader(tmp_path / "arm.rrd").stream():
+        if not chunk.entity_path.startswith("/replay/"):
+            continue
+        batch = chunk.to_record_batch()
+        if chunk.is_static:
+            shapes.add(chunk.entity_path)
+        else:
+            turned = np.array([x[0] for x in batch.column("Transform3D:quaternion").to_pylist()])
+            seconds = np.array([x.value / 1e9 for x in batch.column("time")])
+            poses[chunk.entity_path] = (seconds, 2.0 * np.arctan2(turned[:, 1], turned[:, 3]))
+    assert set(poses) == {"/replay/measured/arm", "/replay/predicted/arm"}
+    assert shapes == {f"{body}/{geom}" for body in poses for geom in (1, 2)}
+    for seconds, angles in poses.values():
+        assert len(seconds) == 300
+        np.testing.assert_allclose(angles, angle[np.rint(seconds / 0.01).astype(int)], atol=5e-3)
+
+
+@needs_rerun
 def test_several_logs_stand_below_their_names(identified, tmp_path):
     result, log = identified
     lacking = write_recording(result, [log, swum(0.9)], tmp_path / "b.rrd")

@@ -8,6 +8,7 @@ entity                    contents
 ``/x/outliers``           samples that are outliers, as points
 ``/inputs/thrust``        an input
 ``/unmodelled/x``         unmodelled force, or acceleration, means over windows; of logs of the identification
+``/replay``               bodies of a machine that MuJoCo simulates (`replay`), in logs of the identification
 ========================  ====================================================================================
 
 Entities of several logs stand below the name of their log.
@@ -31,7 +32,8 @@ from diransac.errors import ResultError
 from diransac.identification.result import Result
 from diransac.plain_text import one_line
 from diransac.report.rendering import encodable
-from diransac.report.runs import Run, simulate_all
+from diransac.report.replay import can_replay, send_replay
+from diransac.report.runs import Entry, Run, simulate_all
 
 _MEASURED, _PREDICTED, _OUTLIERS, _OTHER = (120, 120, 120), (31, 119, 180), (214, 39, 40), (44, 160, 44)
 """Colours, red, green and blue."""
@@ -60,9 +62,8 @@ def write_recording(result: Result, logs: Sequence[Log], path: str | Path) -> li
     """
     rerun = _rerun()
     (entry,) = simulate_all({result.method: result}, logs)
-    parts = {run.log_name: list(_series(run)) for run in entry.runs}
     try:
-        write_with(path, lambda draft: _write(rerun, result, parts, draft))
+        write_with(path, lambda draft: _write(rerun, entry, draft))
     except OSError as error:
         raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from error
     unknown = [run.log_name for run in entry.runs if run.view.diagnosis is None]
@@ -129,21 +130,24 @@ def _outliers(run: Run, name: str) -> BoolArray:
 # ---------------------------------------------------------------------- file
 
 
-def _write(rerun: Any, result: Result, parts: dict[str, list[_Series]], file: Path) -> None:
-    """Write the series of every log, and a view for each signal, for the inputs and for the unmodelled forces."""
-    layout, several = rerun.blueprint, len(parts) > 1
+def _write(rerun: Any, entry: Entry, file: Path) -> None:
+    """Write every log, and a view for the bodies, each signal, the inputs and the unmodelled forces."""
+    layout, several = rerun.blueprint, len(entry.runs) > 1
     tabs = []
     recording = rerun.RecordingStream("diransac")
-    recording.send_recording_name(_text(f"{result.model.name}: {result.method}"))
-    for log, series in parts.items():
-        above = [_text(log)] if several else []
+    recording.send_recording_name(_text(f"{entry.result.model.name}: {entry.result.method}"))
+    for run in entry.runs:
+        above, series = ([_text(run.log_name)] if several else []), list(_series(run))
         for one in series:
             _send(rerun, recording, rerun.new_entity_path([*above, *map(_text, one.path)]), one)
         views = [
             layout.TimeSeriesView(origin=rerun.new_entity_path([*above, _text(group)]), name=_text(group))
             for group in dict.fromkeys(one.path[0] for one in series)
         ]
-        tabs.append(layout.Grid(*views, name=_text(log)))
+        if can_replay(run):
+            send_replay(rerun, recording, above, run, {"measured": _MEASURED, "predicted": _PREDICTED})
+            views.insert(0, layout.Spatial3DView(origin=rerun.new_entity_path([*above, "replay"]), name="replay"))
+        tabs.append(layout.Grid(*views, name=_text(run.log_name)))
     whole = layout.Tabs(*tabs) if several else tabs[0]
     recording.save(file, default_blueprint=layout.Blueprint(whole))
     recording.flush()

@@ -46,6 +46,8 @@ _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
 _BEGINNING = 8
 """Intervals after the beginning of a log, or a gap, in which what changes a state is the beginning's."""
+_INFLUENCE, _ROUNDS = 5.0, 20
+"""What an interval tells of all parameters at most, over the mean of all; rounds until the weights are known."""
 _DELAY_STEP = 1e-6
 """Difference of a delay, samples: a wider one meets contacts that begin a step later, which tell nothing of it."""
 
@@ -56,11 +58,12 @@ class Pass:
 
     Parameters
     ----------
-    loss, lost : float
-        Negative log-likelihood of the predicted samples; the part of intervals in which simulations diverge.
+    losses, lost : (W,) array
+        Negative log-likelihood of the predicted samples of each interval; that of intervals in which simulations
+        diverge, 0 of others.
     scores : (W, n) array
         Contribution of each interval to minus the gradient of the loss with respect to the parameters, the delay of
-        the inputs last if it is estimated.
+        the inputs last if it is estimated; with bounded influence.
     information : (n, n) array
     states : (W, n_x) array
         At the intervals' starts, after their samples.
@@ -72,12 +75,10 @@ class Pass:
         Mean square of the changes of velocities by samples, over what the filter expects.
     errors, expected : (N, n_s) array
         Predicted less measured, and the variance of the prediction.
-    tempered : float
-        Part of the intervals in which a linear model does not hold for the whole step to the likeliest state.
     """
 
-    loss: float
-    lost: float
+    losses: FloatArray
+    lost: FloatArray
     scores: FloatArray
     information: FloatArray
     states: FloatArray
@@ -86,13 +87,12 @@ class Pass:
     surprise: float
     errors: FloatArray
     expected: FloatArray
-    tempered: float
 
-    def loss_with(self, noise: Mixture, known: BoolArray) -> float:
-        """The loss with another noise, and states as uncertain as they were."""
+    def losses_with(self, noise: Mixture, known: BoolArray) -> FloatArray:
+        """The losses ``(W,)`` with another noise, and states as uncertain as they were."""
         wide = np.sqrt(1.0 + self.expected / np.square(noise.sigma))
         own = noise.negative_log_likelihood(self.errors / wide, known) + known * np.log(wide)
-        return float(own.sum()) + self.lost
+        return np.asarray(own.reshape(len(self.lost), -1).sum(axis=1) + self.lost)
 
     def step(
         self, precision: FloatArray, pull: FloatArray, bounds: tuple[FloatArray, FloatArray] | None = None
@@ -138,6 +138,29 @@ def _inverse(information: FloatArray) -> FloatArray:
     d = np.sqrt(np.maximum(np.diag(information), 0.0))
     scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > _TINY)
     return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
+
+
+def _bounded(information: FloatArray) -> FloatArray:
+    """Weights ``(W,)`` with which no interval tells more than a few times its share of all parameters.
+
+    Where a contact is about to begin or to slip, slopes hold in a tiny range alone: they are so steep that one interval
+    would outweigh all others.
+
+    Parameters
+    ----------
+    information : (W, n, n) array
+
+    References
+    ----------
+    Krasker, Welsch 1982 (bounded influence).
+    """
+    n, telling = information.shape[1], np.count_nonzero(information.any(axis=(1, 2)))
+    weights, most = np.ones(len(information)), _INFLUENCE * n / max(telling, 1)
+    for _ in range(_ROUNDS):
+        covariance = _inverse(np.einsum("w,wij->ij", weights, information))
+        told = np.einsum("ij,wji->w", covariance, information)
+        weights = np.minimum(1.0, most / np.maximum(told, _TINY))
+    return weights
 
 
 @dataclass(frozen=True)
@@ -273,17 +296,19 @@ class _Run:
         self.n = len(p) + (later is not None)
         self.states = np.empty((len(one), one.model.n_q + one.model.n_v))
         self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
-        self.information, self.loss, self.lost = np.zeros((self.n, self.n)), 0.0, 0.0
+        self.information, self.losses, self.lost = np.zeros((len(one), self.n, self.n)), *np.zeros((2, len(one)))
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
-        self.surprise, self.age, self.tempered = list[FloatArray](), 0, 0
+        self.surprise, self.age = list[FloatArray](), 0
         self.threads = one.threads if one.threads > 1 else default_threads()
 
     def result(self) -> Pass:
         """Sums of all intervals."""
         surprise = float(np.mean(self.surprise)) if self.surprise else 1.0
-        tempered = self.tempered / max(len(self.states), 1)
-        kept = (self.states, self.jumps, self.residuals, surprise, self.errors, self.expected, tempered)
-        return Pass(self.loss + self.lost, self.lost, self.scores, self.information, *kept)
+        weights = _bounded(self.information)
+        scores = weights[:, None] * self.scores
+        information = np.einsum("w,wij->ij", weights, self.information)
+        kept = (self.states, self.jumps, self.residuals, surprise, self.errors, self.expected)
+        return Pass(self.losses + self.lost, self.lost, scores, information, *kept)
 
     def batch(self, w: int, state: FloatArray, inputs: FloatArray) -> RolloutBatch:
         """One lane over an interval."""
@@ -327,13 +352,13 @@ class _Run:
         assert at.final_slopes is not None
         e, J, F = at.errors[0], at.jacobian[0], at.final_slopes[0]
         if not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST):
-            self.states[w], self.lost = state, self.lost + 10.0 * float(known.sum())
+            self.states[w], self.lost[w] = state, 10.0 * float(known.sum())
             return state, _Belief.begin(self.predictor.unsure, self.n)
         noise = self._noise
         expected = np.einsum("rsi,ij,rsj->rs", J[..., :n_x], belief.covariance, J[..., :n_x])
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
         weights = noise.inlying(e / wide, known) / np.square(noise.sigma)
-        self.loss += float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
+        self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
         update, ends = self._tempered(w, state, belief, (e, J, weights, at.final_states[0]))
         self._count(w, update, belief)
         self.states[w] = state + update.moved
@@ -359,16 +384,14 @@ class _Run:
             )
             after = float(np.where(known, weights * np.square(found[0]), 0.0).sum())
             if np.abs(ends[0]).max() < _LOST and share * after + update.prior <= share * before * (1.0 + _TINY):
-                self.tempered += share < 1.0
                 return update, ends[0]
-        self.tempered += 1
         return _Update.of(belief, (e, J, 0.0 * weights)), end
 
     def _count(self, w: int, update: _Update, belief: _Belief) -> None:
         """Add an interval's contributions."""
         n_q = self.predictor.intervals.model.n_q
         self.age = self.age + 1 if self.predictor.intervals.following[w] else 0
-        self.information += update.information
+        self.information[w] = update.information
         self.scores[w] = update.score
         if self.age < _BEGINNING:
             return

@@ -16,20 +16,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
 
-_PASSES, _CONVERGED, _SETTLED, _HALVINGS = 24, 0.7, 0.05, 3
-"""Passes at most; step of the parameters, standard errors, and relative change of the noise that end them; steps that
-are halved."""
-_NO_WORSE = 1e-4
-"""Part of the loss by which a step may raise it: contacts that begin a step earlier make it jump."""
-_LATEST = 3
-"""Steps that tell how far an estimate wanders from pass to pass."""
+_PASSES, _CONVERGED, _SETTLED, _SETTLED_LACKS, _LEAST_REACH = 30, 0.5, 0.05, 0.1, 0.1
+"""Passes at most; mean step of the parameters, standard errors, and relative changes of the noise, and of what the
+model lacks, that end them; part of a step below which none leads anywhere."""
+_LATEST = 4
+"""Passes that tell whether a fit has ended, and how far an estimate wanders from pass to pass."""
 _SETTLING = 4
 """Passes in which scales settle with parameters that are given."""
 _FASTER, _LEAST_LACKS = 0.75, 1e-4
@@ -48,16 +47,15 @@ class Minimum:
     parameters : (n_p,) array
     last : Pass
     converged : bool
-    wander : (n,) array
-        Root mean square of the last few Gauss-Newton steps, the delay's last: where contacts begin a step earlier or
-        later, they do not end.
+    covariance : (n, n) array
+        Of the parameters and the delay, if it is estimated.
     """
 
     predictor: Predictor
     parameters: FloatArray
     last: Pass
     converged: bool
-    wander: FloatArray
+    covariance: FloatArray
 
 
 def minimised(
@@ -84,45 +82,81 @@ def minimised(
     Minimum
     """
     layout, known = predictor.intervals.layout, predictor.intervals.known
-    converged, stuck, now, steps = False, False, predictor.over_logs(p), list[FloatArray]()
+    converged, now, reach, latest = False, predictor.over_logs(p), 1.0, _Latest((), ())
     for k in range(_PASSES):
         held = predictor.free_delay and k < _EARLY
         none = np.zeros(int(predictor.free_delay))
         precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
         pull = precision * np.concatenate([layout.prior_mean - p, none])
         following = _with_scales(predictor, now, outliers=outliers)
-        noise = following.noise
         step = now.step(precision, pull, _bounds_of_step(predictor, p, held=held))
-        steps.append(step)
+        latest = latest.and_(step, now.robust_covariance(precision))
         if progress is not None:
-            progress(k, Minimum(predictor, p, now, False, _wander(steps)))
-        steady = np.abs(np.log(noise.sigma / predictor.noise.sigma)[predictor.columns]).max() < _SETTLED
-        errors = np.sqrt(np.diag(now.robust_covariance(precision)))
-        if steady and not held and (np.abs(step) <= _CONVERGED * errors).all():
-            converged = True
+            progress(k, Minimum(predictor, p, now, False, latest.covariance()))
+        is_last = reach < _LEAST_REACH
+        if is_last or (not held and _is_steady(predictor, following)):
+            converged = latest.is_at_rest(1.0 if is_last else _CONVERGED)
+        if converged or is_last:
             break
-        before = now.loss_with(noise, known)
-        for _ in range(_HALVINGS):
-            then, predictor = _moved(following, p, step)
-            found = predictor.over_logs(then)
-            if found.loss < before + _NO_WORSE * abs(before):
-                break
-            step = 0.5 * step
-        else:  # no step leads anywhere, unless the scales still move
-            predictor, then = following, p
-            found = predictor.over_logs(p)
-            if stuck:
-                converged = bool((np.abs(step) <= errors).all())
-                now = found
-                break
-        stuck = bool(np.array_equal(then, p))
-        p, now = then, found
-    return Minimum(predictor, p, now, converged, _wander(steps))
+        then, moved = _moved(following, p, reach * step)
+        found = moved.over_logs(then)
+        if _is_worse(found.losses, now.losses_with(following.noise, known)):
+            # What the model lacks has changed, too.
+            now = following.over_logs(p)
+            if _is_worse(found.losses, now.losses):
+                predictor, reach = following, 0.5 * reach
+                continue
+        p, predictor, now, reach = then, moved, found, min(2.0 * reach, 1.0)
+    return Minimum(predictor, p, now, converged, latest.covariance())
 
 
-def _wander(steps: Sequence[FloatArray]) -> FloatArray:
-    """Root mean square ``(n,)`` of the last few steps."""
-    return np.asarray(np.sqrt(np.mean(np.square(steps[-_LATEST:]), axis=0)))
+@dataclass(frozen=True)
+class _Latest:
+    """The latest passes: where contacts begin a step earlier or later, steps do not end, and information jumps.
+
+    Parameters
+    ----------
+    steps : tuple of (n,) array
+        Whole Gauss-Newton steps.
+    covariances : tuple of (n, n) array
+    """
+
+    steps: tuple[FloatArray, ...]
+    covariances: tuple[FloatArray, ...]
+
+    def and_(self, step: FloatArray, covariance: FloatArray) -> _Latest:
+        """With another pass."""
+        return _Latest((*self.steps, step)[-_LATEST:], (*self.covariances, covariance)[-_LATEST:])
+
+    @property
+    def errors(self) -> FloatArray:
+        """Standard errors ``(n,)`` that half of the passes tell at least."""
+        return np.asarray(np.sqrt(np.median([np.diag(x) for x in self.covariances], axis=0)))
+
+    def is_at_rest(self, most: float) -> bool:
+        """True if the steps lead nowhere: their mean is at most so many standard errors."""
+        mean = np.abs(np.mean(self.steps, axis=0))
+        return len(self.steps) == _LATEST and bool((mean <= most * self.errors).all())
+
+    def covariance(self) -> FloatArray:
+        """Covariance ``(n, n)``, with how far an estimate wanders from pass to pass."""
+        of_last = np.sqrt(np.diag(self.covariances[-1]))
+        more = np.divide(self.errors, of_last, out=np.ones_like(of_last), where=of_last > 0.0)
+        wander = np.mean(np.square(self.steps), axis=0)
+        return np.asarray(self.covariances[-1] * np.outer(more, more) + np.diag(wander))
+
+
+def _is_worse(after: FloatArray, before: FloatArray) -> bool:
+    """Whether the losses of intervals are larger than others by more than chance: contacts that begin earlier jump."""
+    more = after - before
+    return bool(more.sum() > CLEAR * np.sqrt(np.square(more).sum()))
+
+
+def _is_steady(predictor: Predictor, following: Predictor) -> bool:
+    """Whether noise, and what the model lacks, no longer change."""
+    noise = np.log(following.noise.sigma / predictor.noise.sigma)[predictor.columns]
+    lacks = np.log(following.lacks / predictor.lacks)
+    return bool(np.abs(noise).max() < _SETTLED and np.abs(lacks) < _SETTLED_LACKS)
 
 
 def settled(predictor: Predictor, p: FloatArray) -> tuple[Predictor, Pass]:

@@ -80,7 +80,7 @@ def estimated_by_simulation(
 
     def progress(k: int, found: Minimum) -> None:
         so_far[:] = [found]
-        text = f"pass {k + 1}: negative log-likelihood {found.last.loss:.6g}"
+        text = f"pass {k + 1}: negative log-likelihood {found.last.losses.sum():.6g}"
         report(callback, "prediction errors", min(0.05 + 0.05 * k, 0.85), text)
 
     predictor = Predictor.of(intervals, outliers=settings.outliers, free_delay=free)
@@ -91,7 +91,7 @@ def estimated_by_simulation(
         if not so_far:
             raise
         found, ended = so_far[0], TIME_LIMIT
-    if found.last.lost > 0.5 * 10.0 * float(intervals.known.sum()):
+    if found.last.lost.sum() > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
             f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
             "start= or --start"
@@ -177,16 +177,10 @@ class _Found:
     ended: str
     notes: tuple[str, ...]
 
-    def covariance(self) -> FloatArray:
-        """Covariance ``(n, n)``, the delay's last if it is estimated; larger as the estimate wanders."""
-        layout, none = self.dataset.layout, np.zeros(int(self.found.predictor.free_delay))
-        precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
-        return np.asarray(self.found.last.robust_covariance(precision) + np.diag(np.square(self.found.wander)))
-
     def estimate(self) -> Estimate:
         """The estimate."""
         dataset, n = self.dataset, len(self.found.parameters)
-        whole = self.covariance()
+        whole = self.found.covariance
         covariance, lost = whole[:n, :n].copy(), self._lost(whole)
         covariance[lost] = covariance[:, lost] = np.inf
         names = dataset.layout.names
