@@ -134,9 +134,12 @@ class _Latest:
         return np.asarray(np.sqrt(np.median([np.diag(x) for x in self.covariances], axis=0)))
 
     def is_at_rest(self, most: float) -> bool:
-        """True if the steps lead nowhere: their mean is at most so many standard errors."""
-        mean = np.abs(np.mean(self.steps, axis=0))
-        return len(self.steps) == _LATEST and bool((mean <= most * self.errors).all())
+        """True if the steps lead nowhere: their mean is at most so many standard errors, but for chance."""
+        if len(self.steps) < _LATEST:
+            return False
+        mean, scatter = np.abs(np.mean(self.steps, axis=0)), np.std(self.steps, axis=0, ddof=1)
+        chance = 2.0 * scatter / np.sqrt(_LATEST)
+        return bool((mean <= most * self.errors + chance).all())
 
     def covariance(self) -> FloatArray:
         """Covariance ``(n, n)``, with how far an estimate wanders from pass to pass."""
