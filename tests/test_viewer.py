@@ -114,7 +114,7 @@ def test_bodies_are_replayed_as_measured_and_as_predicted(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     text = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/><body name="arm" pos="0 0 1">
       <joint name="hinge" axis="0 1 0" damping="{d}"/><geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="1"/>
-      <geom type="box" size=".05 .05 .05" pos="0 0 -.4" mass=".5"/></body></worldbody>
+      <geom type="box" size=".05 .05 .05" pos="0 0 -.4" mass=".5"/><geom size=".06" mass="0"/></body></worldbody>
       <actuator><motor name="drive" joint="hinge"/></actuator></mujoco>"""
     machine = mujoco.MjModel.from_xml_string(text.format(d=0.3))
     data, time, rng = mujoco.MjData(machine), 0.01 * np.arange(600), np.random.default_rng(0)
@@ -143,7 +143,7 @@ def test_bodies_are_replayed_as_measured_and_as_predicted(tmp_path):
             seconds = np.array([x.value / 1e9 for x in batch.column("time")])
             poses[chunk.entity_path] = (seconds, 2.0 * np.arctan2(turned[:, 1], turned[:, 3]))
     assert set(poses) == {"/replay/measured/arm", "/replay/predicted/arm"}
-    assert shapes == {f"{body}/{geom}" for body in poses for geom in (1, 2)}
+    assert shapes == {f"{body}/{geom}" for body in poses for geom in (1, 2, 3)}
     for seconds, angles in poses.values():
         assert len(seconds) == 300
         np.testing.assert_allclose(angles, angle[np.rint(seconds / 0.01).astype(int)], atol=5e-3)

@@ -87,7 +87,7 @@ def _shapes(rerun: Any, run: Run, colour: tuple[int, int, int]) -> Iterator[tupl
             continue
         places, rotations = [compiled.geom_pos[k]], [compiled.geom_quat[k][[1, 2, 3, 0]]]
         pose = {"centers": places, "quaternions": rotations, "colors": [colour]}
-        kind, shape = compiled.geom_type[k], None
+        kind, shape = kinds(int(compiled.geom_type[k])), None
         if kind == kinds.mjGEOM_BOX:
             shape = rerun.Boxes3D(half_sizes=[size], **pose)
         elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
 
-_PASSES, _CONVERGED, _SETTLED, _SETTLED_LACKS, _LEAST_REACH = 30, 0.5, 0.05, 0.1, 0.1
-"""Passes at most; mean step of the parameters, standard errors, and relative changes of the noise, and of what the
-model lacks, that end them; part of a step below which none leads anywhere."""
+_PASSES, _CONVERGED, _LEAST_REACH, _LIKELIER = 30, 0.5, 0.1, 1.0
+"""Passes at most; mean step of the parameters, standard errors, over the latest passes, that ends them; part of a step
+below which none leads anywhere; difference of losses, nats, that counts."""
 _LATEST = 4
 """Passes that tell whether a fit has ended, and how far an estimate wanders from pass to pass."""
 _SETTLING = 4
@@ -82,7 +82,7 @@ def minimised(
     Minimum
     """
     layout, known = predictor.intervals.layout, predictor.intervals.known
-    converged, now, reach, latest = False, predictor.over_logs(p), 1.0, _Latest((), ())
+    converged, now, reach, latest = False, predictor.over_logs(p), 1.0, _Latest((), (), ())
     for k in range(_PASSES):
         held = predictor.free_delay and k < _EARLY
         none = np.zeros(int(predictor.free_delay))
@@ -90,12 +90,11 @@ def minimised(
         pull = precision * np.concatenate([layout.prior_mean - p, none])
         following = _with_scales(predictor, now, outliers=outliers)
         step = now.step(precision, pull, _bounds_of_step(predictor, p, held=held))
-        latest = latest.and_(step, now.robust_covariance(precision))
+        latest = latest.and_(step, now.robust_covariance(precision), now.losses)
         if progress is not None:
             progress(k, Minimum(predictor, p, now, False, latest.covariance()))
         is_last = reach < _LEAST_REACH
-        if is_last or (not held and _is_steady(predictor, following)):
-            converged = latest.is_at_rest(1.0 if is_last else _CONVERGED)
+        converged = not held and latest.are_at_rest(1.0 if is_last else _CONVERGED)
         if converged or is_last:
             break
         then, moved = _moved(following, p, reach * step)
@@ -119,26 +118,29 @@ class _Latest:
     steps : tuple of (n,) array
         Whole Gauss-Newton steps.
     covariances : tuple of (n, n) array
+    losses : tuple of (W,) array
     """
 
     steps: tuple[FloatArray, ...]
     covariances: tuple[FloatArray, ...]
+    losses: tuple[FloatArray, ...]
 
-    def and_(self, step: FloatArray, covariance: FloatArray) -> _Latest:
+    def and_(self, step: FloatArray, covariance: FloatArray, losses: FloatArray) -> _Latest:
         """With another pass."""
-        return _Latest((*self.steps, step)[-_LATEST:], (*self.covariances, covariance)[-_LATEST:])
+        every = (*self.steps, step), (*self.covariances, covariance), (*self.losses, losses)
+        return _Latest(*(x[-_LATEST:] for x in every))
 
     @property
     def errors(self) -> FloatArray:
         """Standard errors ``(n,)`` that half of the passes tell at least."""
         return np.asarray(np.sqrt(np.median([np.diag(x) for x in self.covariances], axis=0)))
 
-    def is_at_rest(self, most: float) -> bool:
-        """True if the steps lead nowhere: their mean is at most so many standard errors, but for chance."""
-        if len(self.steps) < _LATEST:
+    def are_at_rest(self, most: float) -> bool:
+        """True if passes become no likelier, and the mean step is at most so many standard errors, but for chance."""
+        if len(self.steps) < _LATEST or _is_worse(self.losses[0], self.losses[-1]):
             return False
         mean, scatter = np.abs(np.mean(self.steps, axis=0)), np.std(self.steps, axis=0, ddof=1)
-        chance = 2.0 * scatter / np.sqrt(_LATEST)
+        chance = 2.0 * np.minimum(scatter, self.errors) / np.sqrt(_LATEST)
         return bool((mean <= most * self.errors + chance).all())
 
     def covariance(self) -> FloatArray:
@@ -152,14 +154,7 @@ class _Latest:
 def _is_worse(after: FloatArray, before: FloatArray) -> bool:
     """Whether the losses of intervals are larger than others by more than chance: contacts that begin earlier jump."""
     more = after - before
-    return bool(more.sum() > CLEAR * np.sqrt(np.square(more).sum()))
-
-
-def _is_steady(predictor: Predictor, following: Predictor) -> bool:
-    """Whether noise, and what the model lacks, no longer change."""
-    noise = np.log(following.noise.sigma / predictor.noise.sigma)[predictor.columns]
-    lacks = np.log(following.lacks / predictor.lacks)
-    return bool(np.abs(noise).max() < _SETTLED and np.abs(lacks) < _SETTLED_LACKS)
+    return bool(more.sum() > max(_LIKELIER, CLEAR * np.sqrt(np.square(more).sum())))
 
 
 def settled(predictor: Predictor, p: FloatArray) -> tuple[Predictor, Pass]:
