@@ -140,7 +140,7 @@ def _inverse(information: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
 
 
-def _bounded(information: FloatArray) -> FloatArray:
+def bounded_influence(information: FloatArray) -> FloatArray:
     """Weights ``(W,)`` with which no interval tells more than a few times its share of all parameters.
 
     Where a contact is about to begin or to slip, slopes hold in a tiny range alone: they are so steep that one interval
@@ -304,7 +304,7 @@ class _Run:
     def result(self) -> Pass:
         """Sums of all intervals."""
         surprise = float(np.mean(self.surprise)) if self.surprise else 1.0
-        weights = _bounded(self.information)
+        weights = bounded_influence(self.information)
         scores = weights[:, None] * self.scores
         information = np.einsum("w,wij->ij", weights, self.information)
         kept = (self.states, self.jumps, self.residuals, surprise, self.errors, self.expected)

@@ -99,10 +99,10 @@ def minimised(
             break
         then, moved = _moved(following, p, reach * step)
         found = moved.over_logs(then)
-        if _is_worse(found.losses, now.losses_with(following.noise, known)):
+        if is_worse(found.losses, now.losses_with(following.noise, known)):
             # What the model lacks has changed, too.
             now = following.over_logs(p)
-            if _is_worse(found.losses, now.losses):
+            if is_worse(found.losses, now.losses):
                 predictor, reach = following, 0.5 * reach
                 continue
         p, predictor, now, reach = then, moved, found, min(2.0 * reach, 1.0)
@@ -137,7 +137,7 @@ class _Latest:
 
     def are_at_rest(self, most: float) -> bool:
         """True if passes become no likelier, and the mean step is at most so many standard errors, but for chance."""
-        if len(self.steps) < _LATEST or _is_worse(self.losses[0], self.losses[-1]):
+        if len(self.steps) < _LATEST or is_worse(self.losses[0], self.losses[-1]):
             return False
         mean, scatter = np.abs(np.mean(self.steps, axis=0)), np.std(self.steps, axis=0, ddof=1)
         chance = 2.0 * np.minimum(scatter, self.errors) / np.sqrt(_LATEST)
@@ -151,8 +151,14 @@ class _Latest:
         return np.asarray(self.covariances[-1] * np.outer(more, more) + np.diag(wander))
 
 
-def _is_worse(after: FloatArray, before: FloatArray) -> bool:
-    """Whether the losses of intervals are larger than others by more than chance: contacts that begin earlier jump."""
+def is_worse(after: FloatArray, before: FloatArray) -> bool:
+    """Whether losses are larger by more than chance: where a contact begins a step earlier, that of an interval jumps.
+
+    Parameters
+    ----------
+    after, before : (W,) array
+        Of the same intervals, nats.
+    """
     more = after - before
     return bool(more.sum() > max(_LIKELIER, CLEAR * np.sqrt(np.square(more).sum())))
 
