@@ -28,7 +28,7 @@ _RATE = 50.0
 
 
 def can_replay(run: Run) -> bool:
-    """Whether there are bodies, and a log whose motion is known."""
+    """True if there are bodies, and the motion of the log is known."""
     return isinstance(run.result.model, MujocoModel) and run.view.diagnosis is not None
 
 

@@ -152,7 +152,7 @@ class _Latest:
 
 
 def is_worse(after: FloatArray, before: FloatArray) -> bool:
-    """Whether losses are larger by more than chance: where a contact begins a step earlier, that of an interval jumps.
+    """True if losses are larger by more than chance: where a contact begins a step earlier, that of an interval jumps.
 
     Parameters
     ----------
