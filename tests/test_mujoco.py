@@ -258,6 +258,31 @@ def test_a_base_that_nothing_measures_is_followed(hopper_file: Path) -> None:
     assert result.parameters["body/payload.ipos[0]"] == pytest.approx(0.04, abs=0.005)
 
 
+CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
+    <joint name="x" type="slide" axis="1 0 0" damping="{d}"/>
+    <inertial pos="0 0 0" mass="{m}" diaginertia="1 1 1"/></body>
+  </worldbody><actuator><motor name="push" joint="x"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("mass", "late"), [(30.0, 0), (0.5, -3)])
+def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: float, late: int) -> None:
+    machine = mujoco.MjModel.from_xml_string(CART.format(m=1.0, d=2.0))
+    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(2000)
+    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((2000, 2))
+    for k, u in enumerate(force):
+        motion[k] = data.qpos[0], data.qvel[0]
+        data.ctrl[0] = u
+        mujoco.mj_step(machine, data)
+    motion += rng.normal(size=motion.shape) * [1e-4, 1e-3]
+    (tmp_path / "cart.xml").write_text(CART.format(m=mass, d=0.1))
+    log = dr.Log.from_arrays(time, {"x": motion[:, 0], "x_dot": motion[:, 1], "push": np.roll(force, late)})
+    model = dr.models.mujoco(tmp_path / "cart.xml", unknown=["body/cart.mass", "joint/x.damping"])
+    result = dr.identify(model, log)
+    assert dict(result.parameters) == pytest.approx({"body/cart.mass": 1.0, "joint/x.damping": 2.0}, rel=1e-3)
+    assert result.estimate.resolution.timing.delay == pytest.approx(-0.002 * late, abs=5e-5)
+    assert str(result.verdict) == ("usable with care" if late else "usable")
+
+
 def test_the_same_seed_gives_the_same_answer(
     four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result]
 ) -> None:

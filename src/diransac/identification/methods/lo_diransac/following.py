@@ -40,6 +40,8 @@ _SMALL = 1e-3
 _FIRST_NOISE, _LEAST_NOISE, _TINY = 3.0, 1e-3, 1e-12
 """Noise of a signal before anything is fitted, over that of its bends; at least, over its spread."""
 _LOST, _ROUNDING = 1e4, 1e-12
+_FOLLOWED = 0.5
+"""Part of the samples that must agree: if fewer do in two intervals, the motion begins anew with the samples."""
 _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
 _TOLD = 0.3
@@ -260,7 +262,7 @@ class Predictor:
         run = _Run(self, p, inputs, later)
         state, belief = self.first_state(0, home), _Belief.begin(self.unsure, run.n)
         for w in range(len(one)):
-            if w and not one.following[w]:
+            if w and (run.is_lost or not one.following[w]):
                 rest = home if one.log_of[w] != one.log_of[w - 1] else state
                 state, belief = self.first_state(w, rest), _Belief.begin(self.unsure, run.n)
             state, belief = run.interval(w, state, belief)
@@ -298,7 +300,7 @@ class _Run:
         self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
         self.information, self.losses, self.lost = np.zeros((len(one), self.n, self.n)), *np.zeros((2, len(one)))
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
-        self.surprise, self.age = list[FloatArray](), 0
+        self.surprise, self.age, self.is_lost, self.contradicts = list[FloatArray](), 0, False, False
         self.threads = one.threads if one.threads > 1 else default_threads()
 
     def result(self) -> Pass:
@@ -351,13 +353,17 @@ class _Run:
         assert at.final_states is not None
         assert at.final_slopes is not None
         e, J, F = at.errors[0], at.jacobian[0], at.final_slopes[0]
-        if not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST):
+        self.is_lost = not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST)
+        if self.is_lost:
             self.states[w], self.lost[w] = state, 10.0 * float(known.sum())
-            return state, _Belief.begin(self.predictor.unsure, self.n)
+            return state, belief
         noise = self._noise
         expected = np.einsum("rsi,ij,rsj->rs", J[..., :n_x], belief.covariance, J[..., :n_x])
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
-        weights = noise.inlying(e / wide, known) / np.square(noise.sigma)
+        inlying = noise.inlying(e / wide, known)
+        weights, before = inlying / np.square(noise.sigma), self.contradicts
+        self.contradicts = bool(inlying.sum() < _FOLLOWED * known.sum())
+        self.is_lost = self.contradicts and before
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
         update, ends = self._tempered(w, state, belief, (e, J, weights, at.final_states[0]))
         self._count(w, update, belief)
@@ -390,7 +396,7 @@ class _Run:
     def _count(self, w: int, update: _Update, belief: _Belief) -> None:
         """Add an interval's contributions."""
         n_q = self.predictor.intervals.model.n_q
-        self.age = self.age + 1 if self.predictor.intervals.following[w] else 0
+        self.age = self.age + 1 if self.predictor.intervals.following[w] and not self.is_lost else 0
         self.information[w] = update.information
         self.scores[w] = update.score
         if self.age < _BEGINNING:

@@ -22,6 +22,7 @@ from diransac.identification.methods.lo_diransac.diagnosing import diagnosis_of
 from diransac.identification.methods.lo_diransac.following import Predictor
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
+from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
@@ -197,7 +198,7 @@ class _Found:
             resolution=Resolution("rk4", 1, self.found.predictor.intervals.hold, timing),
             notes=self.notes,
             diagnosis=self._diagnosis(tuple(n for n, x in zip(names, lost, strict=True) if x), delay_error),
-            checks=tuple(self._checks()),
+            checks=tuple(self._checks(delay_error)),
         )
 
     def _delay(self, error: float) -> float:
@@ -215,8 +216,15 @@ class _Found:
         has_prior = np.isfinite(self.dataset.layout.prior_std)
         return np.asarray(~has_prior & ~(told & (np.sqrt(np.diag(covariance)[:n]) < _NOTHING_KNOWN * size)))
 
-    def _checks(self) -> Iterator[Finding]:
+    def _checks(self, delay_error: float) -> Iterator[Finding]:
         """Findings on the fit."""
+        early = -self.found.predictor.delay
+        if early - CLEAR * delay_error > 1.0:
+            yield Finding(
+                "bad",
+                f"The inputs seem to act {1e3 * early * self.dataset.dt:.2g} ms before they are recorded",
+                "check their clock, begin closer, with start= or --start, or give input_delay=False",
+            )
         if self.ended not in ("converged", TIME_LIMIT):
             yield Finding(
                 "bad",
