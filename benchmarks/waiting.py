@@ -1,9 +1,10 @@
-"""What a user waits for: the default method warm, cold, from a model seen before, and on long logs; a table of ratios.
+"""What a user waits for: the default method warm, cold, from a model seen before, on long logs and on real records.
 
-Run it as ``python benchmarks/waiting.py [--rows N ...] [--repetitions N] [--without-models]``.  Every figure is
-processor time, or peak memory, of processes of one thread; ratios hold on a machine with other work, too, and the least
-of several repetitions in turns is the least disturbed.  Figs. 2-5 of the paper take minutes to hours: ``diransac study
-run fig2 --store fig2.db`` shows its own time.
+Run it as ``python benchmarks/waiting.py [--rows N ...] [--repetitions N] [--without-models] [--records emps,go2-RL]``
+for a table of ratios.  Every figure is processor time, or peak memory, of processes of one thread; ratios hold on a
+machine with other work, too, and the least of several repetitions in turns is the least disturbed; real records are
+identified once.  Figs. 2-5 of the paper take minutes to hours: ``diransac study run fig2 --store fig2.db`` shows its
+own time.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import compile_time
 from kernel import CLoops, medians, score
+from real import DATA, RECORDS, chosen_records, rows_of
 from speed import N_ROWS, bench_of, hour_log, row, spoilt_log
 
 import diransac as dr
@@ -128,6 +130,23 @@ def compare_lengths(lengths: Sequence[int], repetitions: int) -> None:
         row("    peak memory, kB per row", found["bytes"] / 1000, "2.5, aim 1")
 
 
+def fit_record(name: str) -> None:
+    """Print processor times of the methods that apply to a real record, the default after the others."""
+    methods = ("ols", "output error", "mujoco.sysid", "default")
+    rows = rows_of(RECORDS[name](DATA), methods)
+    print(json.dumps({row["method"]: row["seconds"] for row in rows if row.get("parameters")}))
+
+
+def compare_records(names: Sequence[str]) -> None:
+    """The default over least squares and output error together, or over MuJoCo's where that one stands in."""
+    for name in names:
+        found = measured_here("--fit-record", name)
+        others = [x for x in ("ols", "output error", "mujoco.sysid") if x in found][:2]
+        if "default" in found and others:
+            note = f"{found['default']:.1f} s; " + ", ".join(f"{x} {found[x]:.1f} s" for x in others)
+            row(f"{name}: default / {' + '.join(others)}", found["default"] / sum(found[x] for x in others), "1", note)
+
+
 def compare_kernel() -> None:
     """Scores of 1,024 rollouts over the loop in C."""
     with tempfile.TemporaryDirectory() as folder:
@@ -153,14 +172,19 @@ def main() -> None:
     parser.add_argument("--rows", type=int, nargs="*", default=[100_000], help="lengths of the long logs")
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--without-models", action="store_true", help="leave out the larger models")
+    parser.add_argument("--records", default=None, help="beginnings of the real records' names, separated by commas")
     parser.add_argument("--fit-again", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--fit-long", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--fit-record", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.fit_again:
         fit_again(given.repetitions)
         return
     if given.fit_long:
         fit_long(given.fit_long, given.repetitions)
+        return
+    if given.fit_record:
+        fit_record(given.fit_record)
         return
     print(f"processor time, least of {given.repetitions}; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores\n")
     print(f"{'':<66}{'ratio':>10}  {'at most':<16}measured")
@@ -171,6 +195,10 @@ def main() -> None:
         compare_models()
     compare_lengths(given.rows, given.repetitions)
     compare_kernel()
+    if DATA.is_dir():
+        compare_records(chosen_records(given.records))
+    else:
+        row("real records", None, note=f"left out: {DATA} is missing")
 
 
 if __name__ == "__main__":
