@@ -8,6 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.errors import LogError, SettingsError
+from diransac.identification.tracking.changes import Drift
 from diransac.identification.tracking.starting import smoothed_motion
 from simulated import ROTORCRAFT, VEHICLE, as_log, flight, rotorcraft_acceleration, with_outliers
 
@@ -165,6 +166,29 @@ def test_answer_does_not_depend_on_how_samples_are_handed_over():
         assert parts[-1].parameters == whole[-1].parameters
         assert (parts[-1].covariance == whole[-1].covariance).all()
     assert [now.time for now in fed(columns_of(log), 1, window=2.0)] == [now.time for now in whole]
+
+
+def test_drift_that_forces_may_hide_counts_by_its_probability_before_it_is_clear():
+    drift, grown = Drift(("mass",), {}), []
+    for _ in range(60):  # windows of 5 s, each two standard deviations off what was known
+        drift.learn(np.ones(1), np.full(1, 2e-2), np.full(1, 1e4), 5.0, 0.2, exact=False)
+        grown.append((5.0 * float(drift.rate[0]) / 1e-4, bool(drift.drifting[0])))
+    before = [variance for variance, drifting in grown if not drifting]
+    assert len(before) > 3
+    assert before[0] < 0.5
+    assert (np.diff(before) > 0.0).all()
+    assert grown[-1][1]
+    assert grown[-1][0] > 3.0
+
+
+def test_parameter_that_scatters_by_chance_keeps_what_was_known_of_it():
+    rng, rates = np.random.default_rng(0), []
+    for _ in range(20):
+        drift = Drift(("mass",), {})
+        for _ in range(100):
+            drift.learn(np.ones(1), rng.normal(size=1) * 1e-2, np.full(1, 1e4), 5.0, 0.2, exact=False)
+            rates.append(5.0 * float(drift.rate[0]) / 1e-4)
+    assert np.mean(rates) < 0.05
 
 
 def test_missing_late_and_repeated_samples_are_taken():

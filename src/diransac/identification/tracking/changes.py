@@ -51,22 +51,38 @@ class Drift:
 
     The variance of a parameter that drifts grows by q per second.  The estimate of a window alone differs from that of
     everything before by more than their variances then.  The rate is the likeliest of a grid, with 0 as long as another
-    is not clearly likelier.
+    is not clearly likelier.  Unmodelled forces hide slow drifts from single windows, so that these must be allowed for
+    before they are clear: of a model that is not exact, the likeliest rate counts by its probability.
 
     Parameters
     ----------
     names : tuple of str
     given : mapping of str to float
         Standard deviations of the changes in a second, of parameters whose drift is not estimated.
+
+    Attributes
+    ----------
+    rate : (n,) array
+        Growth of the variances, per second.
+    drifting : (n,) array of bool
+        Parameters that clearly drift.
     """
 
     def __init__(self, names: tuple[str, ...], given: Mapping[str, float]) -> None:
         self.given = np.array([given.get(name, np.nan) for name in names])
         self.likelihood = np.zeros((len(names), len(_RATES)))
         self.rate = np.nan_to_num(np.square(self.given))
+        self.drifting: BoolArray = self.rate > 0.0
 
     def learn(
-        self, values: FloatArray, size: FloatArray, information: FloatArray, window: float, weight: float
+        self,
+        values: FloatArray,
+        size: FloatArray,
+        information: FloatArray,
+        window: float,
+        weight: float,
+        *,
+        exact: bool,
     ) -> None:
         """Update the rates by the difference of a window from what was known before it.
 
@@ -80,6 +96,8 @@ class Drift:
             Duration of the window, s.
         weight : float
             Part of the window that is new.
+        exact : bool
+            Whether its fit is without unmodelled accelerations.
         """
         known = information > 0.0
         variance = 1.0 / np.where(known, information, 1.0)
@@ -92,15 +110,12 @@ class Drift:
         # A single window, however much it differs, is no drift.
         self.likelihood[known] += weight * np.minimum(gain - gain[:, :1], 2.0)[known]
         best = np.argmax(self.likelihood, axis=1)
-        clear = self.likelihood.max(axis=1) > self.likelihood[:, 0] + _CLEAR
         own = np.arange(len(best))
-        estimated = np.where(clear, rates[own, best], 0.0)
+        clear = self.likelihood[own, best] - self.likelihood[:, 0] - _CLEAR
+        probability = clear > 0.0 if exact else 1.0 / (1.0 + np.exp(-clear))
+        estimated = rates[own, best] * probability
         self.rate = np.where(np.isnan(self.given), estimated, np.square(self.given))
-
-    @property
-    def drifting(self) -> BoolArray:
-        """Parameters ``(n,)`` that drift."""
-        return np.asarray(self.rate > 0.0)
+        self.drifting = np.where(np.isnan(self.given), clear > 0.0, self.given > 0.0)
 
 
 class Doubt:
@@ -262,7 +277,8 @@ class Changes:
         """Remember how much a full window differs from what was known before it."""
         T, information = self._duration(window), tests.information[0, -1].copy()
         information[[x.index for x in self._pending]] = 0.0
-        self.drift.learn(window.fit.shared, tests.size[0, -1], information, T, self.step / T)
+        size, share = tests.size[0, -1], self.step / T
+        self.drift.learn(window.fit.shared, size, information, T, share, exact=window.is_exact)
 
     # ------------------------------------------------------------------ a change
 
@@ -326,7 +342,7 @@ class Changes:
         # Steps that follow one another are those of a drift.
         size, information = np.zeros((2, len(self.names)))
         size[step.changed], information[step.changed] = step.sizes, known
-        self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0)
+        self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0, exact=window.is_exact)
         time, before = float(window.times[step.first]), step.before[step.changed]
         self._doubt.since(float(np.abs(step.sizes / before[:, 0]).max()))
         window.begin_with(step.first, step.fit)
