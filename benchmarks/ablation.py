@@ -70,9 +70,9 @@ def _without_source(name: str) -> Part:
 _COMPARED = Comparison.of
 
 
-def _alone(scores: Sequence[Any], timed: np.ndarray) -> Any:
+def _alone(scores: Sequence[Any]) -> Any:
     """The comparison in which the winner has all the weight."""
-    found = _COMPARED(scores, timed)
+    found = _COMPARED(scores)
     return replace(found, weights=np.where(np.arange(len(found.weights)) == found.best, 1.0, 0.0))
 
 
