@@ -1,6 +1,6 @@
 """Ablation of lo-diransac: what each part contributes, on real records, regimes, further machines, and a flight.
 
-``python benchmarks/ablation.py [--parts projection,"least squares+second fit"] [--seeds 1000:1001]
+``python benchmarks/ablation.py [--parts projection,"least squares+simulation error"] [--seeds 1000:1001]
 [--records emps,go2-RL] [--out rows.jsonl] [--table FILE]``
 
 Every run is repeated without one part at a time, or without several that `+` joins: by a setting where there is one,
@@ -96,7 +96,6 @@ def _parts() -> dict[str, Part]:
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
         "least squares": _without_source("least squares"),
         "simulation error": _without_source("simulation error"),
-        "second fit": _without_source("second fit"),
         "competition": Part(replace(DEFAULT, sources=())),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
         "exact fits that cannot win end early": Part(

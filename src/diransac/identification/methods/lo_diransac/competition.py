@@ -1,16 +1,14 @@
 """Competition of estimates: sources propose them, and the arbiter compares their predictions.
 
 Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
-joint fit compete with least squares of all rows and with simulation error.  If one of these predicts better, or as well
-and contradicts the fit, which may be at a local optimum, a second joint fit begins with its parameters and its motion,
-and its estimates compete, too.
+joint fit compete with least squares of all rows and with simulation error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -50,9 +48,7 @@ if TYPE_CHECKING:
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
-# Half width of an interval of 95 %, standard errors.
-_INTERVAL = 1.96
-# Samples of the intervals of a second search at most, as far as their number has divisors.
+# Samples of the intervals of a fit from an estimate at most, as far as their number has divisors.
 _SHORT = 25
 
 
@@ -94,7 +90,7 @@ def compete(
 ) -> Searched:
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
-    A search that fails, or whose estimates another one beats, is followed by a second one, from that estimate.
+    Where no search from samples succeeds, the joint fit begins with the best of the other estimates.
 
     Parameters
     ----------
@@ -112,7 +108,7 @@ def compete(
     Raises
     ------
     IdentificationError
-        The first search fails, and no other estimate predicts much better than that nothing changes.
+        The search fails, and no other estimate predicts much better than that nothing changes.
     TimeLimitError
         The time limit was reached before a search had converged.
     """
@@ -121,66 +117,44 @@ def compete(
         first = likeliest(settings, dataset, seed, callback, whole)
     except (IdentificationError, np.linalg.LinAlgError) as error:
         first, refused = None, error
-    if first is not None and is_settled(first.likeliest, first.motion):
-        return first
-    if first is not None and not first.likeliest.complete:
+    if first is not None and (is_settled(first.likeliest, first.motion) or not first.likeliest.complete):
         return first
     intervals, motion = whole[:2]
     if first is not None:
         intervals, motion = replace(intervals, substeps=first.likeliest.intervals.substeps), first.motion
     contest = Contest(settings, dataset, intervals, motion, seed, callback)
     try:
-        found = _decided(contest, first, whole[2])
+        contest.add_sources(first)
+        if first is not None:
+            return contest.decided(first)
+        found = contest.fit_from_best(whole[2])
+        if found is not None and not is_settled(found.likeliest, found.motion):
+            found = contest.decided(found)
     except TimeLimitError:
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if first is None and (found is None or found.decided is None or not found.decided.summary.predicts):
-        if isinstance(refused, IdentificationError):
-            raise refused
-        failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
-        raise IdentificationError(f"{dataset.source}: {failed}; compare the model's constants with the machine")
-    return found or first  # type: ignore[return-value]  # one of them is there
+    if found is not None and (found.decided is None or found.decided.summary.predicts):
+        return found
+    if isinstance(refused, IdentificationError):
+        raise refused
+    failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
+    raise IdentificationError(f"{dataset.source}: {failed}; compare the model's constants with the machine")
 
 
-def _decided(contest: Contest, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
-    """The search whose estimate predicts best; None where nothing could be compared."""
-    contest.add_sources(first)
-    winner = contest.decide(first)
-    if winner is None:
-        return None
-    searches = [] if first is None else [first]
-    other = contest.challenger(first) if "second fit" in contest.settings.sources else None
-    second = contest.second(other, notes) if other is not None else None
-    if first is not None and second is not None and is_settled(second.likeliest, second.motion):
-        return second
-    if second is not None and other is not None:
-        contest.add_fit(second, f" from {contest.candidates[other].source}")
-        searches.append(second)
-        winner = contest.decide(min(searches, key=lambda x: x.likeliest.cost))
-        assert winner is not None
-    if not searches:
-        return None
-    of_fit = next((x for x in searches if x.likeliest is contest.origins[winner]), None)
-    chosen = of_fit or min(searches, key=contest.loss_of)
-    result = contest.result(winner, chosen.likeliest)
-    acting = None if of_fit else contest.candidates[winner].acting
-    decided = Decided(contest.summary(winner), acting, contest.of_logs(winner, result.parameters))
-    impossible = of_fit.impossible if of_fit else ()
-    return replace(chosen, motion=contest.motion, result=result, decided=decided, impossible=impossible)
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A candidate, the fit or the motion that it came from, and its scores once it has been compared."""
+class _Entry(NamedTuple):
+    """A candidate, and the fit or the motion that it came from."""
 
     candidate: Candidate
     origin: Motion | Explanation
-    scores: Scores | None = None
 
-    def scored(self, arbiter: Arbiter) -> _Entry:
-        """The entry with its scores."""
-        return self if self.scores is not None else replace(self, scores=arbiter.scores(self.candidate))
+
+class _Judgement(NamedTuple):
+    """Scores of all candidates, in their order, and their comparison."""
+
+    arbiter: Arbiter
+    scores: list[Scores]
+    comparison: Comparison
 
 
 @dataclass
@@ -209,31 +183,16 @@ class Contest:
     def __post_init__(self) -> None:
         self.blocks = Blocks.of(self.intervals)
         self.entries: list[_Entry] = []
-        self.judge: Searched | None = None
-        self.arbiter: Arbiter | None = None
-        self.comparison: Comparison | None = None
 
     @property
     def candidates(self) -> list[Candidate]:
         """In the order in which they are preferred where they predict as well."""
         return [x.candidate for x in self.entries]
 
-    @property
-    def origins(self) -> list[Motion | Explanation]:
-        """The fit or the motion that each came from."""
-        return [x.origin for x in self.entries]
-
-    @property
-    def scores(self) -> list[Scores]:
-        """Of all candidates that have been compared."""
-        return [x.scores for x in self.entries if x.scores is not None]
-
-    def add_fit(self, found: Searched, origin: str = "") -> None:
-        """Add the estimates of a joint fit, before those that are there, but after those of a likelier one."""
-        acting = self._acting(found)
-        some = _estimates_of_fit(found.likeliest, acting, self.blocks, origin, projection=self.settings.projection)
-        k = sum(not isinstance(x, Motion) and x.cost < found.likeliest.cost for x in self.origins)
-        self.entries[k:k] = [_Entry(x, found.likeliest) for x in some]
+    def add_fit(self, found: Searched) -> None:
+        """Add the estimates of a joint fit, before those that are there."""
+        some = _estimates_of_fit(found.likeliest, self._acting(found), self.blocks, projection=self.settings.projection)
+        self.entries[:0] = [_Entry(x, found.likeliest) for x in some]
 
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
@@ -273,37 +232,65 @@ class Contest:
         found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
         return np.array(found or [np.ones(len(self.dataset.layout))])
 
-    def decide(self, search: Searched | None) -> int | None:
-        """Index of the winner; None where the logs are too short to be compared, or nothing takes part.
+    def decided(self, search: Searched) -> Searched:
+        """A search with the estimate that predicts best; as it is where the logs are too short to be compared."""
+        judged = self._judged(search)
+        if judged is None:
+            return search
+        winner, origin = self.entries[judged.comparison.best]
+        of_fit = not isinstance(origin, Motion)
+        result = self._result(judged, search.likeliest)
+        of_logs = self._of_logs(judged, result.parameters)
+        outcome = Decided(self._summary(judged), None if of_fit else winner.acting, of_logs)
+        impossible = search.impossible if of_fit else ()
+        return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
-        Outliers and noise are those of a search; another one than before scores all candidates again.
+    def fit_from_best(self, notes: tuple[str, ...]) -> Searched | None:
+        """A search from the estimate that predicts best, and its simulated motion; None where it fails.
+
+        Its estimates take part, too.
+        """
+        judged = self._judged(None)
+        if judged is None or not predicts(judged.scores[judged.comparison.best].errors):
+            return None
+        one, motion = self.entries[judged.comparison.best]
+        assert isinstance(motion, Motion)
+        intervals = one.intervals
+        while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
+            intervals = intervals.split(parts)
+        notes += (f"no sample gives a fit of the whole log; the fit begins with the parameters of {one.name}",)
+        try:
+            found = searched(
+                self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
+                within(self.callback, 0.89, 0.895), hypotheses=one.parameters[None],
+            )  # fmt: skip
+        except (IdentificationError, np.linalg.LinAlgError):
+            return None
+        self.add_fit(found)
+        return found
+
+    def _judged(self, search: Searched | None) -> _Judgement | None:
+        """Comparison of all candidates; None where the logs are too short for one, or nothing takes part.
+
+        Outliers and noise are those of the search.
         """
         if not self.entries:
             return None
         report(self.callback, "comparing predictions", 0.89)
-        if self.arbiter is None or search is not self.judge:
-            self.judge, self.arbiter = search, self._judged_by(search)
-            self.entries = [replace(x, scores=None) for x in self.entries]
-        if self.arbiter is None:
+        inlying, noise = self._noise_of(search)
+        acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
+        arbiter = Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
+        scores = [] if arbiter is None else [arbiter.scores(x) for x in self.candidates]
+        if arbiter is None or not any(np.isfinite(x.losses).any() for x in scores):
             return None
-        self.entries = [x.scored(self.arbiter) for x in self.entries]
-        scores = self.scores
-        if not any(np.isfinite(x.losses).any() for x in scores):
-            return None
-        self.comparison = Comparison.of(scores)
-        best = self.comparison.best
-        winner = self.entries[best].candidate
+        judged = _Judgement(arbiter, scores, Comparison.of(scores))
+        best = judged.comparison.best
+        winner = self.candidates[best]
         errors = ", ".join(f"{x:.2g}" for x in scores[best].errors)
         best_so_far = f"best so far: {winner.name}, held-out errors {errors} of those of no change"
         parameters = dict(zip(self.dataset.layout.names, winner.parameters.tolist(), strict=True))
         report(self.callback, "comparing predictions", 0.89, best_so_far, parameters=parameters)
-        return best
-
-    def _judged_by(self, search: Searched | None) -> Arbiter | None:
-        """The arbiter with the outliers and the noise of a search."""
-        inlying, noise = self._noise_of(search)
-        acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
-        return Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
+        return judged
 
     def _noise_of(self, search: Searched | None) -> tuple[BoolArray, FloatArray]:
         """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
@@ -315,76 +302,37 @@ class Contest:
         noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)
         return inlying | ~own.known, np.maximum(noise, floor)
 
-    def challenger(self, search: Searched | None) -> int | None:
-        """Index of the best estimate that no fit gave, where it predicts, and beats a fit or contradicts one as good.
-
-        Two estimates contradict each other if their intervals of a parameter are disjoint.  An exact model whose noise
-        is not white is contradicted by that.
-        """
-        assert self.comparison is not None
-        as_good, fitted = self.comparison.as_good, np.array([not isinstance(x, Motion) for x in self.origins])
-        found = int(np.argmin(np.where(as_good & ~fitted, self.comparison.losses, np.inf)))
-        if fitted[found] or not as_good[found] or not predicts(self.scores[found].errors):
-            return None
-        if search is None or search.likeliest.exact or not (as_good & fitted).any():
-            return found
-        one, variances = self.candidates[found], np.diag(search.result.covariance)
-        spans = _INTERVAL * (np.sqrt(np.diag(jackknife(one.without))) + np.sqrt(variances))
-        return found if (np.abs(one.parameters - search.result.parameters) > spans).any() else None
-
-    def loss_of(self, search: Searched) -> float:
-        """Least loss of the estimates of a search's fit."""
-        assert self.comparison is not None
-        own = [x for x, y in zip(self.comparison.losses, self.origins, strict=True) if y is search.likeliest]
-        return float(min(own, default=np.inf))
-
-    def of_logs(self, winner: int, parameters: FloatArray) -> tuple[LogEstimate, ...]:
+    def _of_logs(self, judged: _Judgement, parameters: FloatArray) -> tuple[LogEstimate, ...]:
         """Estimates of each of several logs alone, over the horizon at which the winner predicts best.
 
         None after the time limit: what was decided stays.
         """
         if len(self.dataset.segments) < 2:
             return ()
-        assert self.arbiter is not None
         report(self.callback, "comparing logs", 0.895)
-        n_rows = self.arbiter.steps[int(np.argmin(self.scores[winner].errors))]
-        one = replace(self.candidates[winner], parameters=parameters)
+        best = judged.comparison.best
+        n_rows = judged.arbiter.steps[int(np.argmin(judged.scores[best].errors))]
+        one = replace(self.candidates[best], parameters=parameters)
         try:
             return estimates_of_logs(one, self.motion, n_rows, outliers=self.settings.outliers)
         except TimeLimitError:
             return ()
 
-    def second(self, winner: int, notes: tuple[str, ...]) -> Searched | None:
-        """A search from an estimate and its simulated motion; None where it fails."""
-        one, motion = self.candidates[winner], self.origins[winner]
-        assert isinstance(motion, Motion)
-        intervals = one.intervals
-        while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
-            intervals = intervals.split(parts)
-        try:
-            return searched(
-                self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
-                within(self.callback, 0.89, 0.895), hypotheses=one.parameters[None],
-            )  # fmt: skip
-        except (IdentificationError, np.linalg.LinAlgError):
-            return None
-
-    def result(self, winner: int, fit_of: Explanation) -> ProjectedEstimate:
+    def _result(self, judged: _Judgement, fit_of: Explanation) -> ProjectedEstimate:
         """Mean of the winner and of those that predict as well, and a covariance that covers them.
 
         Those whose inputs act at another time than the winner's count in the covariance alone.  Where their mean
         predicts clearly worse than the winner, its own parameters stay.
         """
-        assert self.comparison is not None
-        assert self.arbiter is not None
-        one, weights = self.candidates[winner], self.comparison.weights
+        best, weights = judged.comparison.best, judged.comparison.weights
+        one = self.candidates[best]
         alike = weights * np.array([x.acting.timing == one.acting.timing for x in self.candidates])
         share = alike / alike.sum()
         parameters = np.array([x.parameters for x in self.candidates])
         mean = replace(
             one, parameters=share @ parameters, without=np.tensordot(share, [x.without for x in self.candidates], 1)
         )
-        alone = Comparison.of([self.scores[winner], self.arbiter.scores(mean)])
+        alone = Comparison.of([judged.scores[best], judged.arbiter.scores(mean)])
         centre = mean.parameters if alone.as_good[1] else one.parameters
         apart = parameters - centre
         spread = (weights * apart.T) @ apart / weights.sum()
@@ -404,12 +352,10 @@ class Contest:
         of_fit = fit.shared[:n]
         return ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s, of_fit)
 
-    def summary(self, winner: int) -> Competition:
+    def _summary(self, judged: _Judgement) -> Competition:
         """The comparison, for the result."""
-        assert self.comparison is not None
-        assert self.arbiter is not None
-        names, c = self.dataset.layout.names, self.comparison
-        rows = zip(self.candidates, self.scores, c.losses, c.as_good, strict=True)
+        names, c = self.dataset.layout.names, judged.comparison
+        rows = zip(self.candidates, judged.scores, c.losses, c.as_good, strict=True)
         competitors = tuple(
             Competitor(
                 one.name, tuple(x.errors.tolist()), float(loss), bool(as_good),
@@ -417,11 +363,11 @@ class Contest:
             )
             for one, x, loss, as_good in rows
         )  # fmt: skip
-        return Competition(self.candidates[winner].name, self.arbiter.horizons, competitors)
+        return Competition(self.candidates[c.best].name, judged.arbiter.horizons, competitors)
 
 
 def _estimates_of_fit(
-    explanation: Explanation, acting: ActingInputs, blocks: Blocks, origin: str, *, projection: bool
+    explanation: Explanation, acting: ActingInputs, blocks: Blocks, *, projection: bool
 ) -> Iterator[Candidate]:
     """Parameters read from a fit: by least squares on its motion over windows of each length, and its own."""
     intervals, fit = explanation.intervals, explanation.refinement.fit
@@ -430,14 +376,14 @@ def _estimates_of_fit(
         for seconds, estimate, parameters, parts in projected_candidates(intervals, fit):
             if intervals.layout.violations(parameters) or not np.isfinite(parameters).all():
                 continue
-            name = f"least squares on the fitted motion{origin}, {seconds:.2g} s"
+            name = f"least squares on the fitted motion, {seconds:.2g} s"
             yield Candidate(
                 name, parameters, _left_out(parameters, parts, block, blocks.n), acting, intervals, estimate
             )
     own = fitted_parameters(intervals, fit)
     steps = effect_of_intervals(intervals, fit).steps
     without = _left_out(own.parameters, -steps, block, blocks.n)
-    yield Candidate(f"joint fit{origin}", own.parameters, without, acting, intervals, lambda: own)
+    yield Candidate("joint fit", own.parameters, without, acting, intervals, lambda: own)
 
 
 def _left_out(parameters: FloatArray, parts: FloatArray, block: IntArray, K: int) -> FloatArray:

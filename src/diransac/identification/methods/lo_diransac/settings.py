@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from diransac.identification.structure.candidate_terms import TermLibrary
     from diransac.model import Model
 
-SOURCES = ("least squares", "simulation error", "second fit")
+SOURCES = ("least squares", "simulation error")
 """Sources of estimates besides the samples of the weak form and the joint fit that begins with them."""
 
 

@@ -90,11 +90,6 @@ class Candidate:
             found[:, j] = np.clip(found[:, j], least, bound.upper)
         return np.asarray(found)
 
-    @property
-    def source(self) -> str:
-        """The name without the variant."""
-        return self.name.partition(",")[0]
-
 
 def jackknife(without: FloatArray) -> FloatArray:
     """Covariance ``(n, n)`` from estimates without each block, increased by Student's t for their number."""
