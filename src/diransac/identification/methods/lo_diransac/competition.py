@@ -90,7 +90,8 @@ def compete(
 ) -> Searched:
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
-    Where no search from samples succeeds, the joint fit begins with the best of the other estimates.
+    Where no search from samples succeeds, or only an exact model is found, whose noise contradicts that, another search
+    begins with the best of the other estimates, and the likelier one counts.
 
     Parameters
     ----------
@@ -125,16 +126,14 @@ def compete(
     contest = Contest(settings, dataset, intervals, motion, seed, callback)
     try:
         contest.add_sources(first)
-        if first is not None:
-            return contest.decided(first)
-        found = contest.fit_from_best(whole[2])
+        found = contest.likelier(first, whole[2])
         if found is not None and not is_settled(found.likeliest, found.motion):
             found = contest.decided(found)
     except TimeLimitError:
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if found is not None and (found.decided is None or found.decided.summary.predicts):
+    if found is not None and (first is not None or found.decided is None or found.decided.summary.predicts):
         return found
     if isinstance(refused, IdentificationError):
         raise refused
@@ -190,9 +189,10 @@ class Contest:
         return [x.candidate for x in self.entries]
 
     def add_fit(self, found: Searched) -> None:
-        """Add the estimates of a joint fit, before those that are there."""
+        """Let the estimates of a joint fit take part, before the others, and instead of those of another fit."""
         some = _estimates_of_fit(found.likeliest, self._acting(found), self.blocks, projection=self.settings.projection)
-        self.entries[:0] = [_Entry(x, found.likeliest) for x in some]
+        others = [x for x in self.entries if isinstance(x.origin, Motion)]
+        self.entries = [*(_Entry(x, found.likeliest) for x in some), *others]
 
     def _acting(self, found: Searched) -> ActingInputs:
         """Inputs as they act in a fit."""
@@ -245,29 +245,44 @@ class Contest:
         impossible = search.impossible if of_fit else ()
         return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
-    def fit_from_best(self, notes: tuple[str, ...]) -> Searched | None:
-        """A search from the estimate that predicts best, and its simulated motion; None where it fails.
+    def likelier(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+        """The first search; where there is none, or an exact model, one from the best other estimate if it is likelier.
 
-        Its estimates take part, too.
+        An exact model that competes has noise that contradicts it.
         """
-        judged = self._judged(None)
-        if judged is None or not predicts(judged.scores[judged.comparison.best].errors):
+        if first is not None and not first.likeliest.exact:
+            return first
+        other = self._searched_from_best(first, notes)
+        if other is None or (first is not None and first.likeliest.cost <= other.likeliest.cost):
+            return first
+        self.add_fit(other)
+        return other
+
+    def _searched_from_best(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+        """A search from the best estimate that no fit gave, and its simulated motion.
+
+        None where it fails, the first search predicts better, or no estimate predicts.
+        """
+        judged = self._judged(first)
+        if judged is None:
             return None
-        one, motion = self.entries[judged.comparison.best]
+        as_good, losses = judged.comparison.as_good, judged.comparison.losses
+        others = [k for k, x in enumerate(self.entries) if isinstance(x.origin, Motion) and as_good[k]]
+        best = min(others, key=lambda k: losses[k], default=None)
+        if best is None or not predicts(judged.scores[best].errors):
+            return None
+        one, motion = self.entries[best]
         assert isinstance(motion, Motion)
         intervals = one.intervals
         while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
             intervals = intervals.split(parts)
-        notes += (f"no sample gives a fit of the whole log; the fit begins with the parameters of {one.name}",)
         try:
-            found = searched(
+            return searched(
                 self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
                 within(self.callback, 0.89, 0.895), hypotheses=one.parameters[None],
             )  # fmt: skip
         except (IdentificationError, np.linalg.LinAlgError):
             return None
-        self.add_fit(found)
-        return found
 
     def _judged(self, search: Searched | None) -> _Judgement | None:
         """Comparison of all candidates; None where the logs are too short for one, or nothing takes part.
