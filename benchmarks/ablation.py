@@ -99,9 +99,7 @@ def _parts() -> dict[str, Part]:
         "fit from the best other estimate": Part(patches=(("competition.Contest.likelier", lambda _, x, *__: x),)),
         "competition": Part(replace(DEFAULT, sources=())),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
-        "exact fits that cannot win end early": Part(
-            patches=(("refinement._is_lost", lambda *_: False), ("local_search.Explanation.exact_is_hopeless", False))
-        ),
+        "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
         "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),
         "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),
     }

@@ -16,7 +16,7 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
-from diransac.identification.methods.lo_diransac.local_search import ExactTrial, Explanation, fewest_parts
+from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
@@ -31,7 +31,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     with_residuals,
 )
 from diransac.identification.methods.lo_diransac.projection import projected_candidates, projected_parameters
-from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement, refine_exact
+from diransac.identification.methods.lo_diransac.refinement import Prior, refine_exact
 from diransac.identification.methods.lo_diransac.screening import (
     running_median,
     screened_inputs,
@@ -314,26 +314,6 @@ def test_intervals_are_split_into_equal_parts_of_three_rows_at_least():
     for length in range(1, 80):
         possible = [k for k in range(2, length + 1) if length % k == 0 and length // k >= 3]
         assert fewest_parts(length) == min(possible, default=0)
-
-
-def test_an_exact_model_is_hopeless_until_unmodelled_accelerations_fall_by_as_much_as_it_was_behind():
-    intervals, signals = intervals_of()
-    fit = with_residuals(intervals, perturbed_fit(intervals, signals))
-    now = Explanation(Refinement(intervals, fit, 0.0, 9, True), exact=False)
-    left = np.log(np.sqrt(np.square(unexplained(intervals, fit, projected_parameters(intervals, fit))).mean(axis=0)))
-    samples = float(intervals.known.sum())
-
-    def is_hopeless(behind: float, **changes: object) -> bool:
-        trial = ExactTrial(behind, now.cost, left, intervals.length)
-        return replace(now, trial=replace(trial, **changes)).exact_is_hopeless
-
-    assert not now.exact_is_hopeless
-    assert not is_hopeless(0.9 * samples)
-    assert is_hopeless(1.1 * samples)
-    assert not is_hopeless(1.1 * samples, length=intervals.length + 1)
-    assert not is_hopeless(5.9 * samples, unexplained=left + 5.0)
-    assert is_hopeless(6.1 * samples, unexplained=left + 5.0)
-    assert not is_hopeless(1.1 * samples, cost=now.cost + 0.2 * samples)
 
 
 def test_delay_moves_the_inputs_by_rows():

@@ -60,28 +60,6 @@ _CONTINUOUS = (-0.9, -0.1)
 
 
 @dataclass(frozen=True)
-class ExactTrial:
-    """A fit of the exact model that was less likely than an explanation with unmodelled accelerations.
-
-    Parameters
-    ----------
-    behind : float
-        Nats between them.
-    cost : float
-        Of that explanation.
-    unexplained : (n_v,) array
-        Log of the RMS acceleration that it left to unmodelled accelerations.
-    length : int
-        Samples of its intervals.
-    """
-
-    behind: float
-    cost: float
-    unexplained: FloatArray
-    length: int
-
-
-@dataclass(frozen=True)
 class Explanation:
     """A fit with its freedom.
 
@@ -92,14 +70,11 @@ class Explanation:
         Whether the fit is one of the model as it is.
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
-    trial : ExactTrial, optional
-        The latest, of this explanation or of one that it came from.
     """
 
     refinement: Refinement
     exact: bool
     complete: bool = True
-    trial: ExactTrial | None = None
 
     @property
     def intervals(self) -> ShootingIntervals:
@@ -112,19 +87,6 @@ class Explanation:
         intervals = self.intervals
         n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + len(intervals.all_errors.kinds)
         return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
-
-    @property
-    def exact_is_hopeless(self) -> bool:
-        """True if the exact model was so far behind that what has changed since cannot make it likelier.
-
-        What it leaves goes with the unmodelled accelerations: if these fall by a factor, so do its residuals, and
-        each sample gains the logarithm of it.  It may gain a nat more in every sample, and all that this one has.
-        """
-        trial, intervals = self.trial, self.intervals
-        if trial is None or trial.length != intervals.length:
-            return False
-        fallen = max(0.0, float((trial.unexplained - self.unexplained).max()))
-        return bool(trial.behind > intervals.known.sum() * (1.0 + fallen) + max(trial.cost - self.cost, 0.0))
 
     @cached_property
     def projected(self) -> FloatArray:
@@ -204,10 +166,7 @@ class LocalSearch:
             yield best
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
-            found, trial = list[Explanation](), best.trial
-            for one in sorted(self._with_another_error(best, free_hold=free_hold), key=lambda x: x.cost):
-                found.append(self._simplified(replace(one, trial=trial)))
-                trial = found[-1].trial or trial
+            found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:
                 break
             best = self._accurate(min(found, key=lambda x: x.cost))
@@ -360,7 +319,7 @@ class LocalSearch:
 
     def _simplest(self, flexible: Explanation) -> Explanation:
         """The exact model, if it is as likely; otherwise unmodelled accelerations that vary as fast as is likely."""
-        exact = None if flexible.exact_is_hopeless else self._likeliest_exact(flexible)
+        exact = self._likeliest_exact(flexible)
         if exact is not None and exact.cost < flexible.cost:
             return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
@@ -368,10 +327,7 @@ class LocalSearch:
             if finer.cost > flexible.cost - _AS_LIKELY:
                 break
             flexible = finer
-        if exact is None or not np.isfinite(exact.cost):
-            return flexible
-        cost, length = flexible.cost, flexible.intervals.length
-        return replace(flexible, trial=ExactTrial(exact.cost - cost, cost, flexible.unexplained, length))
+        return flexible
 
     def _likeliest_exact(self, flexible: Explanation) -> Explanation | None:
         """The exact model from the parameters of a fit; None if these are impossible.
