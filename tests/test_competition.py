@@ -295,6 +295,11 @@ def test_an_answer_where_smoothing_sees_nothing(lacking: dr.Result) -> None:
     assert lacking.estimate.resolution.hold == "linear"
 
 
+def test_a_fit_that_others_beat_begins_anew_from_them_and_finds_the_missing_force(lacking: dr.Result) -> None:
+    assert [x.text.partition(":")[0] for x in lacking.suggestions] == ["Constant force on y"]
+    assert lacking.verdict == "usable with care"
+
+
 def test_the_answer_is_a_mean_of_those_that_predict_as_well(lacking: dr.Result) -> None:
     good = [x.parameters for x in lacking.competition.competitors if x.as_good]
     assert len(good) > 1

@@ -90,8 +90,8 @@ def compete(
 ) -> Searched:
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
-    Where no search from samples succeeds, or only an exact model is found, whose noise contradicts that, another search
-    begins with the best of the other estimates, and the likelier one counts.
+    Where no search from samples succeeds, or its fit is doubtful, another one begins with the best of the other
+    estimates, and the likelier one counts.
 
     Parameters
     ----------
@@ -126,9 +126,7 @@ def compete(
     contest = Contest(settings, dataset, intervals, motion, seed, callback)
     try:
         contest.add_sources(first)
-        found = contest.likelier(first, whole[2])
-        if found is not None and not is_settled(found.likeliest, found.motion):
-            found = contest.decided(found)
+        found = contest.outcome(first, whole[2])
     except TimeLimitError:
         if first is None:
             raise
@@ -232,11 +230,30 @@ class Contest:
         found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
         return np.array(found or [np.ones(len(self.dataset.layout))])
 
-    def decided(self, search: Searched) -> Searched:
-        """A search with the estimate that predicts best; as it is where the logs are too short to be compared."""
-        judged = self._judged(search)
+    def outcome(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+        """The likeliest search, with the estimate that predicts best; None where none succeeds.
+
+        The first search stays as it is where the logs are too short to be compared.
+        """
+        found, judged = first, self._judged(first)
         if judged is None:
-            return search
+            return first
+        if first is None or self.is_doubtful(first, judged.comparison):
+            other = self._searched_from_best(judged, notes)
+            if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
+                if is_settled(other.likeliest, other.motion):
+                    return other
+                self.add_fit(other)
+                found, judged = other, self._judged(other) or judged
+        return None if found is None else self._decided(found, judged)
+
+    def is_doubtful(self, search: Searched, comparison: Comparison) -> bool:
+        """True if no estimate of a fit predicts as well as the best, or its model is exact, which its noise denies."""
+        fitted = np.array([not isinstance(x.origin, Motion) for x in self.entries])
+        return search.likeliest.exact or not (comparison.as_good & fitted).any()
+
+    def _decided(self, search: Searched, judged: _Judgement) -> Searched:
+        """A search with the estimate that predicts best."""
         winner, origin = self.entries[judged.comparison.best]
         of_fit = not isinstance(origin, Motion)
         result = self._result(judged, search.likeliest)
@@ -245,27 +262,11 @@ class Contest:
         impossible = search.impossible if of_fit else ()
         return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
-    def likelier(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
-        """The first search; where there is none, or an exact model, one from the best other estimate if it is likelier.
-
-        An exact model that competes has noise that contradicts it.
-        """
-        if first is not None and not first.likeliest.exact:
-            return first
-        other = self._searched_from_best(first, notes)
-        if other is None or (first is not None and first.likeliest.cost <= other.likeliest.cost):
-            return first
-        self.add_fit(other)
-        return other
-
-    def _searched_from_best(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+    def _searched_from_best(self, judged: _Judgement, notes: tuple[str, ...]) -> Searched | None:
         """A search from the best estimate that no fit gave, and its simulated motion.
 
-        None where it fails, the first search predicts better, or no estimate predicts.
+        None where it fails, a fit predicts better, or no estimate predicts.
         """
-        judged = self._judged(first)
-        if judged is None:
-            return None
         as_good, losses = judged.comparison.as_good, judged.comparison.losses
         others = [k for k, x in enumerate(self.entries) if isinstance(x.origin, Motion) and as_good[k]]
         best = min(others, key=lambda k: losses[k], default=None)
