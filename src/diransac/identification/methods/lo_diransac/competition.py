@@ -244,8 +244,8 @@ class Contest:
                 if is_settled(other.likeliest, other.motion):
                     return other
                 self.add_fit(other)
-                found, judged = other, self._judged(other) or judged
-        return None if found is None else self._decided(found, judged)
+                found, judged = other, self._judged(other)
+        return found if found is None or judged is None else self._decided(found, judged)
 
     def is_doubtful(self, search: Searched, comparison: Comparison) -> bool:
         """True if no estimate of a fit predicts as well as the best, or its model is exact, which its noise denies."""

@@ -361,7 +361,7 @@ class _Run:
         expected = np.einsum("rsi,ij,rsj->rs", J[..., :n_x], belief.covariance, J[..., :n_x])
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
         inlying = noise.inlying(e / wide, known)
-        weights, before = inlying / np.square(noise.sigma), self.contradicts
+        weights, before = inlying / np.square(noise.sigma), self.contradicts and bool(one.following[w])
         self.contradicts = bool(inlying.sum() < _FOLLOWED * known.sum())
         self.is_lost = self.contradicts and before
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
