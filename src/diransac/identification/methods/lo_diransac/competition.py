@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
+# Half width of an interval of 95 %, standard errors.
+_INTERVAL = 1.96
 # Samples of the intervals of a fit from an estimate at most, as far as their number has divisors.
 _SHORT = 25
 
@@ -91,7 +93,7 @@ def compete(
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
     Where no search from samples succeeds, or its fit is doubtful, another one begins with the best of the other
-    estimates, and the likelier one counts.
+    estimates, and the likelier of the two counts.
 
     Parameters
     ----------
@@ -238,8 +240,9 @@ class Contest:
         found, judged = first, self._judged(first)
         if judged is None:
             return first
-        if first is None or self.is_doubtful(first, judged.comparison):
-            other = self._searched_from_best(judged, notes)
+        best = self._best_other(judged)
+        if best is not None and (first is None or self.is_doubtful(first, judged, best)):
+            other = self._searched_from(best, notes)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
                 if is_settled(other.likeliest, other.motion):
                     return other
@@ -247,10 +250,24 @@ class Contest:
                 found, judged = other, self._judged(other)
         return found if found is None or judged is None else self._decided(found, judged)
 
-    def is_doubtful(self, search: Searched, comparison: Comparison) -> bool:
-        """True if no estimate of a fit predicts as well as the best, or its model is exact, which its noise denies."""
+    def is_doubtful(self, search: Searched, judged: _Judgement, rival: int) -> bool:
+        """True if a fit's model is exact, which its noise denies, or if a rival beats or contradicts its estimates.
+
+        Two estimates contradict each other if their intervals of a parameter are disjoint.
+        """
         fitted = np.array([not isinstance(x.origin, Motion) for x in self.entries])
-        return search.likeliest.exact or not (comparison.as_good & fitted).any()
+        if search.likeliest.exact or not (judged.comparison.as_good & fitted).any():
+            return True
+        one, variances = self.candidates[rival], np.diag(search.result.covariance)
+        spans = _INTERVAL * (np.sqrt(np.diag(jackknife(one.without))) + np.sqrt(variances))
+        return bool((np.abs(one.parameters - search.result.parameters) > spans).any())
+
+    def _best_other(self, judged: _Judgement) -> int | None:
+        """The best estimate that no fit gave; None where a fit predicts better, or no estimate predicts."""
+        as_good, losses = judged.comparison.as_good, judged.comparison.losses
+        others = [k for k, x in enumerate(self.entries) if isinstance(x.origin, Motion) and as_good[k]]
+        best = min(others, key=lambda k: losses[k], default=None)
+        return best if best is not None and predicts(judged.scores[best].errors) else None
 
     def _decided(self, search: Searched, judged: _Judgement) -> Searched:
         """A search with the estimate that predicts best."""
@@ -262,16 +279,8 @@ class Contest:
         impossible = search.impossible if of_fit else ()
         return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
-    def _searched_from_best(self, judged: _Judgement, notes: tuple[str, ...]) -> Searched | None:
-        """A search from the best estimate that no fit gave, and its simulated motion.
-
-        None where it fails, a fit predicts better, or no estimate predicts.
-        """
-        as_good, losses = judged.comparison.as_good, judged.comparison.losses
-        others = [k for k, x in enumerate(self.entries) if isinstance(x.origin, Motion) and as_good[k]]
-        best = min(others, key=lambda k: losses[k], default=None)
-        if best is None or not predicts(judged.scores[best].errors):
-            return None
+    def _searched_from(self, best: int, notes: tuple[str, ...]) -> Searched | None:
+        """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""
         one, motion = self.entries[best]
         assert isinstance(motion, Motion)
         intervals = one.intervals
