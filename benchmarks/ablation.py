@@ -96,7 +96,7 @@ def _parts() -> dict[str, Part]:
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
         "least squares": _without_source("least squares"),
         "simulation error": _without_source("simulation error"),
-        "second fit": Part(patches=(("competition.Contest.is_doubtful", lambda *_: False),)),
+        "second fit": Part(patches=(("competition.Contest.is_challenged", lambda *_: False),)),
         "competition": Part(replace(DEFAULT, sources=())),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
         "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),

@@ -65,7 +65,7 @@ class SteppedFit:
 
 
 class _Before(NamedTuple):
-    """What the intervals before a step leave: boundary, parameters and their standard errors, evidence in nats."""
+    """Boundary, parameters with standard errors, and evidence in nats that the intervals before a step leave."""
 
     boundary: BoundaryPrior
     parameters: FloatArray

@@ -1,7 +1,8 @@
 """Competition of estimates: sources propose them, and the arbiter compares their predictions.
 
 Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
-joint fit compete with least squares of all rows and with simulation error.
+joint fit compete with least squares of all rows and with simulation error.  Where one of these beats or contradicts the
+fit, which may be at a local optimum, another one begins with its parameters and its motion, and the likelier counts.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def compete(
 ) -> Searched:
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
-    Where no search from samples succeeds, or its fit is doubtful, another one begins with the best of the other
+    Where no search from samples succeeds, or its fit is challenged, another one begins with the best of the other
     estimates, and the likelier of the two counts.
 
     Parameters
@@ -241,7 +242,7 @@ class Contest:
         if judged is None:
             return first
         best = self._best_other(judged)
-        if best is not None and (first is None or self.is_doubtful(first, judged, best)):
+        if best is not None and (first is None or self.is_challenged(first, judged, best)):
             other = self._searched_from(best, notes)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
                 if is_settled(other.likeliest, other.motion):
@@ -250,8 +251,8 @@ class Contest:
                 found, judged = other, self._judged(other)
         return found if found is None or judged is None else self._decided(found, judged)
 
-    def is_doubtful(self, search: Searched, judged: _Judgement, rival: int) -> bool:
-        """True if a fit's model is exact, which its noise denies, or if a rival beats or contradicts its estimates.
+    def is_challenged(self, search: Searched, judged: _Judgement, rival: int) -> bool:
+        """True if a fit is exact although its noise is not white, or if a rival beats or contradicts its estimates.
 
         Two estimates contradict each other if their intervals of a parameter are disjoint.
         """

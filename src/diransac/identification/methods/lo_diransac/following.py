@@ -49,7 +49,7 @@ _TOLD = 0.3
 _BEGINNING = 8
 """Intervals after the beginning of a log, or a gap, in which what changes a state is the beginning's."""
 _INFLUENCE, _ROUNDS = 5.0, 20
-"""What an interval tells of all parameters at most, over the mean of all; rounds until the weights are known."""
+"""Influence of an interval on all parameters at most, over the mean of all; rounds until the weights are known."""
 _DELAY_STEP = 1e-6
 """Difference of a delay, samples: a wider one meets contacts that begin a step later, which tell nothing of it."""
 
