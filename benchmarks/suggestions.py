@@ -132,6 +132,48 @@ def cart_pole(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.
     return model, [log_of(rng, 0.01, signals, {"x": 3e-4, "theta": 1e-3}, {"force": inputs[:, 0]}, f"cart-pole {seed}")]
 
 
+def slipping_joint(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.Model, list[dr.Log]]:
+    """Two rotors with an elastic joint; missing: dry friction between them."""
+    rng = np.random.default_rng([7, seed])
+    return _joint(rng, missing * rng.uniform(0.05, 0.2), 0.0, actuator)
+
+
+def stiffening_joint(seed: int, missing: bool, actuator: Actuator = float) -> tuple[dr.Model, list[dr.Log]]:
+    """Two rotors with an elastic joint; missing: a cubic spring between them."""
+    rng = np.random.default_rng([8, seed])
+    return _joint(rng, 0.0, missing * rng.uniform(200.0, 800.0), actuator)
+
+
+def _joint(rng: np.random.Generator, coulomb: float, cubic: float, actuator: Actuator) -> tuple[dr.Model, list[dr.Log]]:
+    p = drawn(rng, rotor=0.02, inertia=0.05, stiffness=12.0, damping=0.03, friction=0.05)
+    wave = Multisine(rng, 1.5, 0.3, 6.0, 8)
+
+    def rates(x: Array, u: Array) -> Array:
+        twist, slip = x[0] - x[1], x[2] - x[3]
+        torque = p["stiffness"] * twist + cubic * twist**3 + p["damping"] * slip + coulomb * np.tanh(slip / 0.01)
+        return np.array(
+            [x[2], x[3], (actuator(u[0]) - torque - p["friction"] * x[2]) / p["rotor"], torque / p["inertia"]]
+        )
+
+    states, inputs = simulate(rates, [0, 0, 0, 0], lambda t, x: [wave(t)], 3000, 0.005, 10)
+    units = {
+        "rotor": "kg m^2",
+        "inertia": "kg m^2",
+        "stiffness": "N m/rad",
+        "damping": "N m s/rad",
+        "friction": "N m s/rad",
+    }
+
+    def equations(q, v, a, u, p):  # noqa: ANN001, ANN202
+        torque = p.stiffness * (q.motor - q.load) + p.damping * (v.motor - v.load)
+        return [p.rotor * a.motor + torque + p.friction * v.motor - u.torque, p.inertia * a.load - torque]
+
+    model = dr.Model("joint", {"motor": "rad", "load": "rad"}, {"torque": "N m"}, parameters(units), equations)
+    signals = {"motor": states[:, 0], "load": states[:, 1]}
+    noise = {"motor": 1e-3, "load": 1e-3}
+    return model, [log_of(rng, 0.005, signals, noise, {"torque": inputs[:, 0]}, "joint")]
+
+
 def arm(seed: int, missing: bool) -> tuple[dr.Model, list[dr.Log]]:
     """Two links under computed torques; missing: the rise of dry friction at rest (Stribeck), 30 to 60 %."""
     rng = np.random.default_rng([3, seed])
@@ -323,6 +365,8 @@ CASES = {
     "arm without Stribeck friction": Case(arm, ("Stribeck friction",), ("q1", "q2")),
     "rotorcraft without quadratic drag": Case(rotorcraft, ("quadratic drag",), ("x", "z")),
     "underwater vehicle in a current": Case(underwater_vehicle, ("asymmetric drag",), ("x",)),
+    "joint without dry friction between rotors": Case(slipping_joint, ("Coulomb friction",), ("motor",)),
+    "joint without a cubic spring": Case(stiffening_joint, ("cubic stiffness",), ("motor",)),
     "pendulum with a dead band": Case(pendulum, ("dead band",), ("torque",), actuator=dead_band(0.05)),
     "pendulum with a curved torque": Case(pendulum, ("curved input",), ("torque",), actuator=curved(0.1)),
     "cart-pole with a dead band": Case(cart_pole, ("dead band",), ("force",), actuator=dead_band(0.4)),
