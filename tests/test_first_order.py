@@ -305,7 +305,10 @@ def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names
 def test_a_resonance_that_smoothing_takes_for_noise_is_found():
     """A search that begins with the smoothed motion ends at rotors that are three times as heavy."""
     found = dr.identify(flexible_joint(), recorded(stiff_joint_signals(), ["motor"], 0.01), differentiate=True)
-    assert found.verdict == "usable"
+    # At this noise, dry friction between the rotors could be a part of the damping, and of nothing else.
+    (care,) = [str(x) for x in found.findings if x.level in ("care", "bad")]
+    assert care.startswith("If the model lacks a term, damping may be")
+    assert "dry friction of motor - load" in care
     for name in ("rotor", "inertia", "stiffness"):
         assert found.parameters[name] == pytest.approx(STIFF[name], rel=0.03)
     assert all(abs(x - STIFF[n]) < 4.0 * found.standard_errors[n] for n, x in found.parameters.items())

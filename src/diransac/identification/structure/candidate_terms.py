@@ -13,7 +13,7 @@ candidate terms); Fossen 2011, section 8 (currents); Tao, Kokotovic 1996 (dead b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.errors import ModelError
-from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS, Suggestion
+from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS, Suggestion, name_of_term, unit_over
 from diransac.model import Model, expressions
 from diransac.model.derivation import Symbols, call_user
 
@@ -39,10 +39,11 @@ class CandidateTerm:
     ----------
     kind : str
         Effect, such as ``"Coulomb friction"``.
-    equation : int
-        Index of the equation; -1 for a change of an input, which acts in every equation that the input enters.
+    equation : str
+        Coordinate or velocity whose equation has the code; the input, for a change of one, which acts in every equation
+        that the input enters.
     place : str
-        Coordinate, velocity or input in the name of the parameter and in sentences.
+        Coordinate, velocity, difference of these, or input in sentences.
     formula : str
         The term for readers, such as ``sign(x_dot)``.
     code : str
@@ -57,10 +58,12 @@ class CandidateTerm:
         Smallest and largest coefficient that is possible.
     name : str, optional
         Name in an engineer's words, such as ``dry friction of x``.
+    also : mapping of str to str, optional
+        Further equations in which the term acts, and their code.
     """
 
     kind: str
-    equation: int
+    equation: str
     place: str
     formula: str
     code: str
@@ -69,6 +72,26 @@ class CandidateTerm:
     residuals: ca.SX
     bounds: tuple[float, float] = (-np.inf, np.inf)
     name: str = ""
+    also: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RelativeMotion:
+    """A motion of several velocities on which a term of the model depends, as a spring or damper between two bodies.
+
+    Parameters
+    ----------
+    velocities : (n_v,) array
+        Factors of the velocities whose sum it is; the first that is not zero is 1.
+    forces : (n_v,) array
+        Residuals of each equation by what it drives; the first that is not zero is 1 or -1.
+    speed : float
+        RMS.
+    """
+
+    velocities: FloatArray
+    forces: FloatArray
+    speed: float
 
 
 @dataclass(frozen=True)
@@ -149,8 +172,8 @@ class CandidateTerms:
             text = f"{term.name[0].upper()}{term.name[1:]}: {size} ± {spread}{unit}{formula} {share}"
         h = ca.Function("term", list(self.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
         return Suggestion(
-            term.kind, term.place, text, term.parameter, value, error, term.unit, explained,
-            term.code, expressions.stored(f"term {term.parameter}", h), term.name,
+            term.kind, term.equation, text, term.parameter, value, error, term.unit, explained,
+            term.code, expressions.stored(f"term {term.parameter}", h), term.name, term.also,
         )  # fmt: skip
 
 
@@ -166,14 +189,19 @@ def _in_every_row(function: ca.Function, arrays: Sequence[FloatArray]) -> FloatA
 
 
 def candidate_terms(
-    model: Model, speeds: FloatArray, inputs: FloatArray, library: TermLibrary | None = None
+    model: Model,
+    speeds: FloatArray,
+    inputs: FloatArray,
+    relative: Sequence[RelativeMotion] = (),
+    library: TermLibrary | None = None,
 ) -> CandidateTerms:
     """The library of candidates of a model.
 
     In the equation of each velocity v: ``sign(v)``, Stribeck friction at several speeds, ``v``, ``|v| v``, ``|v|``
     (drag in a current), a constant, the position, its square and cube, harmonics of every angle, other velocities and
-    all products of velocities; besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a
-    dead band of several widths and a saturation at several levels.
+    all products of velocities.  Friction, drag, springs and constants also act between what the model connects.
+    Besides them the user's expressions, and of each input a gain, an offset, ``|u| u``, a dead band of several widths
+    and a saturation at several levels.
 
     Parameters
     ----------
@@ -182,6 +210,7 @@ def candidate_terms(
         RMS of each velocity, its unit; velocities that are zero get no friction.
     inputs : (n_u, 2) array
         RMS of each input, its unit, and the size up to which it mostly goes; inputs that are zero get a gain alone.
+    relative : sequence of RelativeMotion, optional
     library : callable, optional
         The user's expressions by name.
 
@@ -197,9 +226,44 @@ def candidate_terms(
     symbols = tuple(ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
     maker = _Maker(model, symbols, speeds, inputs)
     terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
+    terms += [x for one in relative for x in maker.between(one)]
     if library is not None:
         terms += maker.of_user(library)
     return CandidateTerms(symbols, (*terms, *maker.of_inputs()))
+
+
+@dataclass(frozen=True)
+class _Expression:
+    """An expression, as it is read, as code, and its unit; None if that is unknown."""
+
+    value: ca.SX
+    formula: str
+    code: str
+    unit: str | None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where terms act: on a coordinate or a velocity, or between several.
+
+    Parameters
+    ----------
+    name, label : str
+        In sentences, and in the names of parameters.
+    motion : RelativeMotion
+    speed : _Expression
+    position : _Expression or None
+        None without coordinates that are the integrals of the velocities.
+    unit : str
+        That of the position; empty if the force on it has no usual name.
+    """
+
+    name: str
+    label: str
+    motion: RelativeMotion
+    speed: _Expression
+    position: _Expression | None
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -211,78 +275,100 @@ class _Maker:
     speeds: FloatArray
     inputs: FloatArray
 
+    def alone(self, i: int) -> _Place:
+        """One velocity and its equation."""
+        one = np.eye(self.model.n_v)[i]
+        sign = -1.0 if self.model.force_sign < 0 else 1.0
+        return self.place(RelativeMotion(one, sign * one, float(self.speeds[i])))
+
+    def place(self, motion: RelativeMotion) -> _Place:
+        """Where terms of a motion act."""
+        model, (q, v, *_), names = self.model, self.symbols, self.model.rate_names
+        used = [names[k] for k in np.flatnonzero(motion.velocities)]
+        speed = _sum(motion.velocities, v, model.velocities, names, "v")
+        position, unit = None, model.coordinates.get(used[0], "")
+        if model.kinematics is None and used[0] in model.coordinates:
+            position = _sum(motion.velocities[: model.n_q], q, model.coordinates, names, "q")
+        return _Place(
+            (position or speed).formula if len(used) > 1 else used[0], "_".join(used), motion, speed, position, unit
+        )
+
     def of_equation(self, i: int) -> Iterator[CandidateTerm]:
         """Candidates in one equation, the simplest first."""
-        first_order = self.model.rate_names[i] in self.model.first_order
-        if first_order:
-            yield from self._of_own_state(i)
-        elif self.speeds[i] > 0.0:
-            yield from self._of_own_speed(i)
-        yield self._term("constant term" if first_order else "constant force", i, "bias", "", "", ca.SX(1), "")
-        yield from self._of_positions(i)
-        yield from self._of_other_speeds(i)
-
-    def _of_own_speed(self, i: int) -> Iterator[CandidateTerm]:
-        v, name, code = self.symbols[1][i], list(self.model.velocities)[i], f"v.{self.model.rate_names[i]}"
-        unit = list(self.model.velocities.values())[i]
-        speed = float(f"{0.01 * self.speeds[i]:.1g}")
-        sign, smooth = ca.tanh(v / speed), f"ca.tanh({code} / {speed:g})"
-        yield self._term("Coulomb friction", i, "coulomb", f"sign({name})", smooth, sign, "")
-        yield self._term("viscous friction", i, "viscous", name, code, v, unit)
-        drag = f"ca.fabs({code}) * {code}"
-        yield self._term("quadratic drag", i, "quadratic", f"|{name}| {name}", drag, ca.fabs(v) * v, f"({unit})^2")
-        yield self._term("asymmetric drag", i, "current", f"|{name}|", f"ca.fabs({code})", ca.fabs(v), unit)
-        for factor in (0.03, 0.06, 0.12, 0.25):
-            slow = float(f"{factor * self.speeds[i]:.2g}")
-            yield self._term(
-                "Stribeck friction",
-                i,
-                "stribeck",
-                f"sign({name}) exp(-({name} / {slow:g})^2)",
-                f"{smooth} * ca.exp(-(({code} / {slow:g}) ** 2))",
-                sign * ca.exp(-((v / slow) ** 2)),
-                "",
-            )
-
-    def _of_own_state(self, i: int) -> Iterator[CandidateTerm]:
-        s, name = self.symbols[1][i], self.model.rate_names[i]
-        unit = self.model.first_order[name]
-        yield self._term("linear term", i, "linear", name, f"v.{name}", s, unit)
-        yield self._term("quadratic term", i, "quadratic", f"{name}^2", f"v.{name} ** 2", s**2, f"({unit})^2")
-
-    def _of_positions(self, i: int) -> Iterator[CandidateTerm]:
-        derived = self.model.kinematics is None
+        place = self.alone(i)
+        yield from self.of_own_motion(place)
         for k, (name, unit) in enumerate(self.model.coordinates.items()):
-            q = self.symbols[0][k]
-            if derived and k == i:
-                yield self._term("stiffness", i, "stiffness", name, f"q.{name}", q, unit)
-                for n, kind in ((2, "quadratic"), (3, "cubic")) if unit != "rad" else ():
-                    code = f"q.{name} ** {n}"
-                    yield self._term(
-                        f"{kind} stiffness", i, f"{kind}_stiffness", f"{name}^{n}", code, q**n, f"({unit})^{n}"
-                    )
-            for n in (1, 2, 3) if unit == "rad" else ():
-                many = f"{n} " if n > 1 else ""
-                kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"
-                for function in ("sin", "cos"):
-                    code = f"ca.{function}({n} * q.{name})" if n > 1 else f"ca.{function}(q.{name})"
-                    value = getattr(ca, function)(n * q)
-                    label = f"{function}{n if n > 1 else ''}_{name}"
-                    yield self._term(kind, i, label, f"{function}({many}{name})", code, value, "")
+            if place.position is not None and name == place.name:
+                yield from self._of_springs(place, 1 if unit == "rad" else 3)
+            if unit == "rad":
+                yield from self._of_angle(place, self.symbols[0][k], name)
+        yield from self._of_other_speeds(place)
 
-    def _of_other_speeds(self, i: int) -> Iterator[CandidateTerm]:
+    def between(self, motion: RelativeMotion) -> Iterator[CandidateTerm]:
+        """Candidates that act between what a term of the model connects."""
+        place = self.place(motion)
+        yield from self.of_own_motion(place)
+        if place.position is not None:
+            yield from self._of_springs(place, 3)
+
+    def of_own_motion(self, place: _Place) -> Iterator[CandidateTerm]:
+        """Friction and drag, or decay of states of first order, and a constant."""
+        first_order = self.model.rate_names[int(np.flatnonzero(place.motion.velocities)[0])] in self.model.first_order
+        if first_order:
+            yield self._term("linear term", place, "linear", _power(place.speed, 1))
+            yield self._term("quadratic term", place, "quadratic", _power(place.speed, 2))
+        elif place.motion.speed > 0.0:
+            yield from self._of_speed(place)
+        one = _Expression(ca.SX(1), "", "", "")
+        yield self._term("constant term" if first_order else "constant force", place, "bias", one)
+
+    def _of_speed(self, place: _Place) -> Iterator[CandidateTerm]:
+        v, speed = place.speed.value, place.speed
+        name, code, unit = speed.formula, speed.code, speed.unit
+        slow = float(f"{0.01 * place.motion.speed:.1g}")
+        sign, smooth = ca.tanh(v / slow), f"ca.tanh({_single(code)} / {slow:g})"
+        yield self._term("Coulomb friction", place, "coulomb", _Expression(sign, f"sign({name})", smooth, ""))
+        yield self._term("viscous friction", place, "viscous", _power(speed, 1))
+        drag = f"|{name}| {_single(name)}", f"ca.fabs({code}) * {_single(code)}", f"({unit})^2"
+        yield self._term("quadratic drag", place, "quadratic", _Expression(ca.fabs(v) * v, *drag))
+        size = f"|{name}|", f"ca.fabs({code})", unit
+        yield self._term("asymmetric drag", place, "current", _Expression(ca.fabs(v), *size))
+        for factor in (0.03, 0.06, 0.12, 0.25):
+            slow = float(f"{factor * place.motion.speed:.2g}")
+            formula = f"sign({name}) exp(-({_single(name)} / {slow:g})^2)"
+            decay = f"{smooth} * ca.exp(-(({_single(code)} / {slow:g}) ** 2))"
+            value = sign * ca.exp(-((v / slow) ** 2))
+            yield self._term("Stribeck friction", place, "stribeck", _Expression(value, formula, decay, ""))
+
+    def _of_springs(self, place: _Place, most: int) -> Iterator[CandidateTerm]:
+        assert place.position is not None
+        for n, kind in ((1, ""), (2, "quadratic "), (3, "cubic "))[:most]:
+            label = f"{kind}stiffness".replace(" ", "_")
+            yield self._term(f"{kind}stiffness", place, label, _power(place.position, n))
+
+    def _of_angle(self, place: _Place, q: ca.SX, name: str) -> Iterator[CandidateTerm]:
+        for n in (1, 2, 3):
+            many, times = (f"{n} ", f"{n} * ") if n > 1 else ("", "")
+            kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"
+            for function in ("sin", "cos"):
+                value = getattr(ca, function)(n * q)
+                of_angle = _Expression(value, f"{function}({many}{name})", f"ca.{function}({times}q.{name})", "")
+                yield self._term(kind, place, f"{function}{n if n > 1 else ''}_{name}", of_angle)
+
+    def _of_other_speeds(self, place: _Place) -> Iterator[CandidateTerm]:
         v, signals, rates = self.symbols[1], list(self.model.velocities), self.model.rate_names
-        units = list(self.model.velocities.values())
-        for j in range(self.model.n_v):
-            if j != i:
-                yield self._term(
-                    f"coupling to {signals[j]}", i, f"coupling_{rates[j]}", signals[j], f"v.{rates[j]}", v[j], units[j]
-                )
+        units, i = list(self.model.velocities.values()), rates.index(place.name)
+        speeds = [_Expression(v[j], signals[j], f"v.{rates[j]}", units[j]) for j in range(self.model.n_v)]
+        # What two coordinates dissipate together acts on both alike (Rayleigh).
+        n_reciprocal = self.model.n_q if place.position is not None else 0
+        for j, other in enumerate(speeds):
+            if j > i or (j < i and j >= n_reciprocal):
+                back = [(j, float(place.motion.forces[i]), speeds[i])] if j < n_reciprocal else []
+                yield self._term(f"coupling to {signals[j]}", place, f"coupling_{rates[j]}", other, back)
         for j, k in combinations_with_replacement(range(self.model.n_v), 2):
             formula, code = f"{signals[j]} {signals[k]}", f"v.{rates[j]} * v.{rates[k]}"
-            unit = f"({units[j]}) ({units[k]})"
-            label = f"product_{rates[j]}_{rates[k]}"
-            yield self._term("product of velocities", i, label, formula, code, v[j] * v[k], unit)
+            product = _Expression(v[j] * v[k], formula, code, f"({units[j]}) ({units[k]})")
+            yield self._term("product of velocities", place, f"product_{rates[j]}_{rates[k]}", product)
 
     def of_user(self, library: TermLibrary) -> Iterator[CandidateTerm]:
         """The user's expressions in every equation."""
@@ -301,7 +387,7 @@ class _Maker:
             if not str(name).isidentifier():
                 raise ModelError(f"{label}: {name!r} cannot name a candidate term; use letters, digits and underscores")
             for i in range(self.model.n_v):
-                yield self._term(name, i, name, name, name, value, None)
+                yield self._term(name, self.alone(i), name, _Expression(value, name, name, None))
 
     def of_inputs(self) -> Iterator[CandidateTerm]:
         """Changes of each input, in every equation that it enters, the simplest first."""
@@ -314,7 +400,7 @@ class _Maker:
                 line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
                 h = ca.densify(slope * value)
                 called = KINDS[kind][0].format(x=name)
-                yield CandidateTerm(kind, -1, name, formula, line, parameter, of_value, h, bounds, called)
+                yield CandidateTerm(kind, name, name, formula, line, parameter, of_value, h, bounds, called)
 
     def _changes(
         self, name: str, u: ca.SX, unit: str, size: float, largest: float
@@ -328,7 +414,7 @@ class _Maker:
         yield INPUT_GAIN, "gain_error", name, "", u, "1", (-0.5, 0.5)
         if not size > 0.0:
             return
-        code, per_unit = f"u.{name}", _over("1", "" if unit == "1" else unit)
+        code, per_unit = f"u.{name}", unit_over("1", "" if unit == "1" else unit)
         yield "input offset", "offset", "", "", ca.SX(1), unit, (-np.inf, np.inf)
         curve, least = f" * ca.fabs({code}) * {code}", -most / (2.0 * largest)
         yield "curved input", "curvature", f"|{name}| {name}", curve, ca.fabs(u) * u, per_unit, (least, np.inf)
@@ -345,20 +431,34 @@ class _Maker:
             yield "saturation", "saturation", f"({name} beyond {level:g})", beyond, value, "1", (-most, 0.0)
 
     def _term(
-        self, kind: str, i: int, label: str, formula: str, code: str, value: ca.SX, unit: str | None
+        self,
+        kind: str,
+        place: _Place,
+        label: str,
+        expression: _Expression,
+        others: Sequence[tuple[int, float, _Expression]] = (),
     ) -> CandidateTerm:
-        """A term in one equation; ``unit`` is that of the expression, None if unknown."""
-        place = self.model.rate_names[i]
-        sign, parameter = -1 if self.model.force_sign < 0 else 1, self._free(f"{label}_{place}")
-        residuals = ca.SX(self.model.n_v, 1)
-        residuals[i] = sign * value
-        factor = f" * {code}" if code else ""
-        line = f"{'-' if sign < 0 else '+'} p.{parameter}{factor}"
+        """A term at a place; it also acts in other equations, with a factor."""
+        forces, names, parameter = place.motion.forces, self.model.rate_names, self._free(f"{label}_{place.label}")
         known = self.model.kinematics is None and self.model.force_sign
-        force = {"m": "N", "rad": "N m"}.get(self.model.coordinates.get(place, ""), "") if known else ""
-        whole = "" if unit is None or not force else _over(force, unit)
-        name = _name(kind, place, formula, self.model.coordinates.get(place, ""))
-        return CandidateTerm(kind, i, place, formula, line, parameter, whole, residuals, name=name)
+        force = {"m": "N", "rad": "N m"}.get(place.unit, "") if known else ""
+        parts = [*((k, float(forces[k]), expression) for k in np.flatnonzero(forces).tolist()), *others]
+        residuals = ca.SX(self.model.n_v, 1)
+        for k, factor, summand in parts:
+            residuals[k] = factor * summand.value
+        (first, code), *also = ((names[k], _summand(factor, parameter, x)) for k, factor, x in parts)
+        return CandidateTerm(
+            kind,
+            first,
+            place.name,
+            expression.formula,
+            code,
+            parameter,
+            "" if expression.unit is None or not force else unit_over(force, expression.unit),
+            residuals,
+            name=name_of_term(kind, place.name, expression.formula, place.unit),
+            also=dict(also),
+        )
 
     def _free(self, name: str) -> str:
         """The name, or the next that no signal and no parameter has."""
@@ -368,32 +468,32 @@ class _Maker:
         return next(x for x in names if x not in taken)
 
 
-def _name(kind: str, place: str, formula: str, unit: str) -> str:
-    """Name of a term in the equation of a coordinate with a unit, or of a velocity without one."""
-    force, first = {"m": "force along", "rad": "torque about"}.get(unit, "force on"), kind.partition(" ")[0]
-    if kind in KINDS and KINDS[kind][0]:
-        return KINDS[kind][0].format(x=place, force=force)
-    if first in ("gravity", "harmonic"):
-        angle = kind.rpartition(" ")[2]
-        if first == "harmonic":
-            return f"ripple of the {force} {place}, {kind.split()[1]} periods per turn of {angle}"
-        return f"gravity {force.removeprefix('force ')} {place}" + (f", as {angle} tilts" if angle != place else "")
-    if first == "coupling":
-        return f"viscous coupling of {place} to {kind.rpartition(' ')[2]}"
-    if kind == "product of velocities":
-        a, b = formula.split(" ")
-        cause = "Coriolis" if a != b else "centrifugal"
-        return f"{cause} {force} {place}, by {a if a == b else f'{a} and {b}'}"
-    return f"{kind} on {place}"
+def _sum(
+    factors: FloatArray, values: ca.SX, signals: Mapping[str, str], names: Sequence[str], vector: str
+) -> _Expression:
+    """A weighted sum of signals; its unit is that of the first, whose factor is 1."""
+    formula, code, used = "", "", np.flatnonzero(factors).tolist()
+    for k in used:
+        sign = "" if k == used[0] else " - " if factors[k] < 0.0 else " + "
+        size = abs(float(factors[k]))
+        formula += f"{sign}{'' if size == 1.0 else f'{size:g} '}{list(signals)[k]}"
+        code += f"{sign}{'' if size == 1.0 else f'{size!r} * '}{vector}.{names[k]}"
+    value = sum((float(factors[k]) * values[k] for k in used[1:]), values[used[0]])
+    return _Expression(value, formula, code, list(signals.values())[used[0]])
 
 
-_QUOTIENTS = {
-    "m": "/m", "rad": "/rad", "m/s": " s/m", "rad/s": " s/rad", "(m/s)^2": " s^2/m^2", "(rad/s)^2": " s^2/rad^2",
-    "(m/s) (m/s)": " s^2/m^2", "(rad/s) (rad/s)": " s^2/rad^2", "(m/s) (rad/s)": " s^2/(m rad)",
-    "(rad/s) (m/s)": " s^2/(m rad)", "N": "/N",
-}  # fmt: skip
+def _summand(factor: float, parameter: str, x: _Expression) -> str:
+    """Code of a summand of a residual, with its sign."""
+    size = "" if abs(factor) == 1.0 else f"{abs(factor)!r} * "
+    return f"{'-' if factor < 0.0 else '+'} {size}p.{parameter}{f' * {x.code}' if x.code else ''}"
 
 
-def _over(force: str, unit: str) -> str:
-    """Unit of a force over that of an expression: ``N`` over ``m/s`` is ``N s/m``."""
-    return force + _QUOTIENTS.get(unit, f"/({unit})") if unit else force
+def _power(x: _Expression, n: int) -> _Expression:
+    if n == 1:
+        return replace(x, formula=_single(x.formula), code=_single(x.code))
+    return _Expression(x.value**n, f"{_single(x.formula)}^{n}", f"{_single(x.code)} ** {n}", f"({x.unit})^{n}")
+
+
+def _single(text: str) -> str:
+    """A sum in parentheses."""
+    return f"({text})" if " " in text else text

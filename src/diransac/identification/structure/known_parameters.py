@@ -172,7 +172,9 @@ class KnownParameters:
         name, constants = found.parameter, (*self.fixed, *self.held)
         while name in constants:
             name += "_2"
-        code = re.sub(rf"\bp\.{found.parameter}\b", f"p.{name}", found.code)
+        code, *others = (
+            re.sub(rf"\bp\.{found.parameter}\b", f"p.{name}", x) for x in (found.code, *found.also.values())
+        )
         sizes = {**self.model.argument_sizes, "p": self.model.n_p - len(constants)}
         term = expressions.restored("term", found.term, sizes, {"h": self.model.n_v})
         q, v, a, u = (ca.SX.sym(n, sizes[n]) for n in "qvau")
@@ -180,7 +182,8 @@ class KnownParameters:
         every = zip(self.model.parameters, ca.vertsplit(p), strict=True)
         own = ca.vertcat(*(x for n, x in every if n not in constants))
         h = ca.Function("term", [q, v, a, u, p], [term(q, v, a, u, own)], list("qvaup"), ["h"])
-        return replace(found, parameter=name, code=code, term=expressions.stored(f"parameter {name}", h))
+        also, stored = dict(zip(found.also, others, strict=True)), expressions.stored(f"parameter {name}", h)
+        return replace(found, parameter=name, code=code, term=stored, also=also)
 
 
 def _as_mapping(fixed: object) -> Mapping[str, object]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Any
 
@@ -52,6 +52,45 @@ KINDS = {
 
 {force} is a force along or a torque about a coordinate, or what acts on a velocity.
 """
+
+
+def name_of_term(kind: str, place: str, formula: str, unit: str) -> str:
+    """Name of a term in an engineer's words.
+
+    Parameters
+    ----------
+    kind, place, formula : str
+        As those of `PossibleTerm`.
+    unit : str
+        Unit of the coordinate; empty for a velocity that is the derivative of none.
+    """
+    force, first = {"m": "force along", "rad": "torque about"}.get(unit, "force on"), kind.partition(" ")[0]
+    if kind in KINDS and KINDS[kind][0]:
+        return KINDS[kind][0].format(x=place, force=force)
+    if first in ("gravity", "harmonic"):
+        angle = kind.rpartition(" ")[2]
+        if first == "harmonic":
+            return f"ripple of the {force} {place}, {kind.split()[1]} periods per turn of {angle}"
+        return f"gravity {force.removeprefix('force ')} {place}" + (f", as {angle} tilts" if angle != place else "")
+    if first == "coupling":
+        return f"viscous coupling of {place} to {kind.rpartition(' ')[2]}"
+    if kind == "product of velocities":
+        a, b = formula.split(" ")
+        cause = "Coriolis" if a != b else "centrifugal"
+        return f"{cause} {force} {place}, by {a if a == b else f'{a} and {b}'}"
+    return f"{kind} on {place}"
+
+
+_QUOTIENTS = {
+    "m": "/m", "rad": "/rad", "m/s": " s/m", "rad/s": " s/rad", "(m/s)^2": " s^2/m^2", "(rad/s)^2": " s^2/rad^2",
+    "(m/s) (m/s)": " s^2/m^2", "(rad/s) (rad/s)": " s^2/rad^2", "(m/s) (rad/s)": " s^2/(m rad)",
+    "(rad/s) (m/s)": " s^2/(m rad)", "N": "/N",
+}  # fmt: skip
+
+
+def unit_over(force: str, unit: str) -> str:
+    """Unit of a force over that of an expression: ``N`` over ``m/s`` is ``N s/m``."""
+    return force + _QUOTIENTS.get(unit, f"/({unit})") if unit else force
 
 
 @dataclass(frozen=True)
@@ -253,6 +292,8 @@ class Suggestion:
         The term without its coefficient, ``(q, v, a, u, p) -> h (n_v)``, as data.
     name : str, optional
         Name in an engineer's words, such as ``dry friction of x``.
+    also : mapping of str to str, optional
+        Further equations that lack the term, as one between two bodies, and their code.
     """
 
     kind: str
@@ -266,6 +307,7 @@ class Suggestion:
     code: str
     term: Mapping[str, Any]
     name: str = ""
+    also: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def declaration(self) -> str:
@@ -280,7 +322,8 @@ class Suggestion:
             if self.kind in INPUT_CHANGES
             else f"add to the equation of {self.equation}:"
         )
-        return f"{where} {self.code}, with the parameter {self.declaration}"
+        also = "".join(f", to that of {name}: {code}" for name, code in self.also.items())
+        return f"{where} {self.code}{also}, with the parameter {self.declaration}"
 
 
 def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:

@@ -24,7 +24,7 @@ from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
+from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
 from diransac.identification.methods.lo_diransac.projection import projected_parameters
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
@@ -358,13 +358,7 @@ class LocalSearch:
 
     def _split(self, coarse: Explanation, parts: int) -> Explanation:
         """The fit with unmodelled accelerations that vary faster."""
-        fit, intervals = coarse.refinement.fit, coarse.intervals.split(parts)
-        n_x = fit.x.shape[1]
-        series = coarse.intervals.rollouts.trajectories(coarse.intervals.batch(fit.shared, fit.x, fit.d))
-        x = series[:, :: intervals.length, :n_x].reshape(-1, n_x)
-        rho = fit.rho ** (1.0 / parts)
-        begin = with_residuals(intervals, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
-        return self._optimised(coarse, intervals, begin)
+        return self._optimised(coarse, *split(coarse.intervals, coarse.refinement.fit, parts))
 
 
 def fewest_parts(length: int) -> int:

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.parts import Change
     from diransac.identification.settings import Settings
 
 _GAUSSIAN = 10_000
@@ -206,7 +205,11 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         with suppress(np.linalg.LinAlgError):  # squares of tiny or huge numbers, of which no term can be tested
             candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
             lacks = None if likeliest.exact else missing_terms(candidates)
-    ambiguity = _ambiguity(parts.changes, lacks, len(result.parameters))
+    ambiguity = np.zeros((len(result.parameters),) * 2)
+    if lacks is not None:
+        ambiguity += np.outer(lacks.change, lacks.change)
+    for one in parts.changes:
+        ambiguity[one.index, one.index] += one.variance
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
@@ -217,16 +220,6 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
     return _estimate(settings, found, end, checks)
-
-
-def _ambiguity(changes: Sequence[Change], lacks: MissingTerms | None, n: int) -> FloatArray:
-    """Covariance ``(n, n)`` of parameters that change during the log, or with terms that the model lacks."""
-    found = np.zeros((n, n))
-    if lacks is not None:
-        found += np.outer(lacks.change, lacks.change)
-    for one in changes:
-        found[one.index, one.index] += one.variance
-    return found
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:

@@ -26,8 +26,9 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.motion_equations import (
     equations_of_rows,
-    inertia_of_motion,
+    inertia_slopes,
     means_of_intervals,
+    regressors_of_rows,
     residuals_of_motion,
     slopes_of_delays,
 )
@@ -35,18 +36,19 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     innovations,
     linearize,
     of_logs,
-    sum_in_places,
+    split,
+    sum_of_products,
     weights_of,
 )
 from diransac.identification.methods.lo_diransac.term_evidence import (
     CandidateTests,
-    MeanForces,
     TermRegression,
     select_terms,
     weighted,
 )
-from diransac.identification.structure.candidate_terms import TermLibrary, candidate_terms
-from diransac.identification.structure.lacking_terms import PossibleTerm
+from diransac.identification.structure.candidate_terms import RelativeMotion, TermLibrary, candidate_terms
+from diransac.identification.structure.lacking_terms import PossibleTerm, with_terms
+from diransac.identification.structure.structural import structural
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.structure.candidate_terms import CandidateTerms
     from diransac.identification.structure.lacking_terms import Suggestion
+    from diransac.model import Model
 
 # Part of the samples of an input that its size bounds.
 _MOSTLY = 0.99
@@ -63,11 +66,15 @@ _KEPT = 1e-3
 _EQUIVALENT = 1e-6
 # Draws of a motion, and as many per parameter and equation; the seed.
 _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
+# Relative size of what is none in regressors that are linear, and in vectors of unit length.
+_RANK = 1e-7
 # Factor of the prior of discrepancies that holds them at zero.
 _HELD = 1e-3
 # Part of the information of an interval, and of the largest force, that is rounding.
 _ROUNDING = 1e-12
 _HUGE, _TINY = 1e9, 1e-300
+# Numbers of a regression on all terms at most (80 MB, a tenth of a second).
+_MOST = 1e7
 
 
 @dataclass(frozen=True)
@@ -82,8 +89,6 @@ class Candidates:
         Coefficients with which the RMS force of a term is that of the largest force of its equation.
     regression : TermRegression
         On these, and on a delay of each input.
-    forces : MeanForces
-        Of these; 0 in intervals without a row that counts.
     inertia : (W, n_v, n_v) array
         Mean of each interval.
     """
@@ -91,13 +96,22 @@ class Candidates:
     library: CandidateTerms
     units: FloatArray
     regression: TermRegression
-    forces: MeanForces
     inertia: FloatArray
+
+    def without(self, left_out: Sequence[int]) -> Candidates:
+        """All but some of the terms."""
+        kept = np.delete(np.arange(len(self.library)), left_out).tolist()
+        return Candidates(
+            replace(self.library, terms=tuple(self.library.terms[k] for k in kept)),
+            self.units[kept],
+            self.regression.of([*kept, *range(len(self.library), self.regression.columns.shape[2])]),
+            self.inertia,
+        )
 
     @property
     def tests(self) -> CandidateTests:
         """Tests of the terms one by one, at the delays of the fit."""
-        alone = self.regression.of(range(len(self.library)))
+        alone = self.regression.of(slice(len(self.library)))
         return CandidateTests(self.library.terms, self.units, *alone.estimates(), alone.effects)
 
 
@@ -110,9 +124,9 @@ class MissingTerms:
     suggestions : tuple of Suggestion
         The most probable one first; empty where none is supported by the logs.
     change : (n,) array
-        Change of the parameters in a regression that has the terms, too.
+        Change of the parameters with the first suggestion.
     accelerations : (W, n_v) array
-        What the suggested terms explain of the unmodelled acceleration of each interval, beside such changes.
+        What the suggested terms explain of the unmodelled acceleration of each interval.
     """
 
     suggestions: tuple[Suggestion, ...]
@@ -138,30 +152,27 @@ def candidates_of_fit(
     -------
     Candidates
     """
-    p, counted = fit.shared[: intervals.n_p], intervals.occupied
+    p = fit.shared[: intervals.n_p]
     motion, r, W, M = residuals_of_motion(intervals, fit, p)
-    candidates, largest = _library(intervals, motion, library), _largest_forces(intervals, fit, motion, r, W, M)
-    weights = _weights_of_rows(intervals)
-    means = np.where(counted[:, None, None], candidates.means(motion, weights, intervals.length), 0.0)
-    relative = (np.sqrt(np.square(means).sum(axis=0) / counted.sum()) / (largest[:, None] + _TINY)).max(axis=0)
+    drawn, largest = _drawn(intervals, motion), _largest_forces(intervals, fit, motion, r, W, M)
+    candidates = _library(intervals, motion, drawn, library)
+    finer, fit = split(intervals, fit, _parts(intervals, fit, len(candidates)))
+    means = candidates.means(motion, _weights_of_rows(finer), finer.length)
+    means = np.where(finer.occupied[:, None, None], means, 0.0)
+    relative = (np.sqrt(np.square(means).sum(axis=0) / finer.occupied.sum()) / (largest[:, None] + _TINY)).max(axis=0)
     acting = np.isfinite(relative) & (relative > _ROUNDING)
-    chosen = np.flatnonzero(acting & ~_replaceable(intervals, motion, candidates))
-    means = means[:, :, chosen]
-    rows = (r, W, slopes_of_delays(intervals, motion, p))
-    r, W, delays = (_means(intervals, weights, x) for x in rows)
-    inertia = np.where(counted[:, None, None], means_of_intervals(intervals, M), np.eye(len(largest)))
-    accelerations = -np.linalg.solve(inertia, np.concatenate([means, delays], axis=2))
-
-    def inertia_of(changes: FloatArray) -> FloatArray:
-        return inertia_of_motion(intervals, motion, p + changes[: intervals.n_p])[intervals.counted]
-
-    return Candidates(
+    chosen = np.flatnonzero(acting & ~_replaceable(drawn, candidates))
+    effects = np.concatenate([means[:, :, chosen], _means(finer, slopes_of_delays(intervals, motion, p))], axis=2)
+    inertia, acts = _mean_inertia(intervals, M), (effects != 0.0).any(axis=0)
+    accelerations = -np.linalg.solve(_mean_inertia(finer, M), effects)
+    regression = _regression(finer, fit, result, accelerations, inertia, acts, _inertia_slopes(intervals, drawn))
+    found = Candidates(
         replace(candidates, terms=tuple(candidates.terms[k] for k in chosen)),
         1.0 / relative[chosen],
-        _regression(intervals, fit, result, accelerations),
-        MeanForces(r, np.concatenate([W, delays], axis=2), means, largest, inertia_of),
+        regression,
         inertia,
     )
+    return found.without(_never_determined(intervals, found))
 
 
 def missing_terms(found: Candidates) -> MissingTerms:
@@ -175,20 +186,23 @@ def missing_terms(found: Candidates) -> MissingTerms:
     -------
     MissingTerms
     """
-    terms, forces = found.library.terms, found.forces
-    beside_delays = found.regression
+    terms, beside_delays = found.library.terms, found.regression
     for k in range(len(terms), found.regression.columns.shape[2]):
         beside_delays = beside_delays.beside(k)
-    regression = beside_delays.of(range(len(terms)))
-    chosen = select_terms(terms, found.units, regression, forces)
-    changes, values = forces.changes(chosen)
+    regression = beside_delays.of(slice(len(terms)))
+    chosen, shares = select_terms(terms, found.units, regression)
+    values, errors = regression.joint(chosen)
     suggestions = tuple(
-        found.library.suggestion(k, float(value), regression.error(k, chosen), forces.explained(chosen[:i], k))
-        for i, (k, value) in enumerate(zip(chosen, values, strict=True))
+        found.library.suggestion(k, float(value), float(error), share)
+        for k, value, error, share in zip(chosen, values, errors, shares, strict=True)
     )
-    explained = forces.own @ changes + forces.terms[:, :, chosen] @ values
-    accelerations = -np.linalg.solve(found.inertia, explained[:, :, None])[:, :, 0]
-    return MissingTerms(suggestions, changes[: len(found.regression.effects)], np.asarray(accelerations))
+    left = regression
+    for k in chosen:
+        left = left.beside(k)
+    explained = regression.force - left.force
+    accelerations = np.linalg.solve(found.inertia, explained[:, :, None])[:, :, 0]
+    change = regression.effects[:, chosen[:1]] @ regression.joint(chosen[:1])[0]
+    return MissingTerms(suggestions, change, np.asarray(accelerations))
 
 
 def possible_terms(
@@ -214,7 +228,8 @@ def possible_terms(
     own = np.diag(covariance)
     own = np.where(np.isfinite(own), own, np.inf)
     # With the term, least squares, simulation error and the fit would agree: what the fit has then is the estimate's.
-    shifts = tests.effects * means + (result.of_fit - result.parameters)[:, None]
+    changes = tests.effects * means
+    shifts = changes / found.regression.smaller(changes) + (result.of_fit - result.parameters)[:, None]
     added = weights * (np.square(tests.effects) * variances + np.square(shifts))
     kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
     return tuple(
@@ -232,12 +247,17 @@ def possible_terms(
     )
 
 
-def _library(intervals: ShootingIntervals, motion: Sequence[FloatArray], library: TermLibrary | None) -> CandidateTerms:
+def _library(
+    intervals: ShootingIntervals, motion: Sequence[FloatArray], drawn: _DrawnMotion, library: TermLibrary | None
+) -> CandidateTerms:
     """Candidates with the speeds and inputs of a motion: q, v, a, u and p of every row."""
-    speeds = np.sqrt(np.square(motion[1][intervals.counted]).mean(axis=0))
-    inputs = motion[3][intervals.counted]
+    velocities, inputs = (x[intervals.counted] for x in (motion[1], motion[3]))
     sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
-    return candidate_terms(intervals.model, speeds, sizes, library)
+    relative = [
+        RelativeMotion(rates, forces, float(np.sqrt(np.square(velocities @ rates).mean())))
+        for rates, forces in _connections(intervals.model, drawn)
+    ]
+    return candidate_terms(intervals.model, np.sqrt(np.square(velocities).mean(axis=0)), sizes, relative, library)
 
 
 def _weights_of_rows(intervals: ShootingIntervals) -> FloatArray:
@@ -247,59 +267,105 @@ def _weights_of_rows(intervals: ShootingIntervals) -> FloatArray:
     return np.asarray(counted / np.repeat(counts, intervals.length))
 
 
-def _means(intervals: ShootingIntervals, weights: FloatArray, values: FloatArray) -> FloatArray:
-    """Weighted means ``(W, ...)`` of rows; 0 in intervals without a row that counts."""
+def _means(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+    """Means ``(W, ...)`` of the rows that count; 0 in intervals without one."""
+    weights = _weights_of_rows(intervals)
     weighted = np.where(weights > 0.0, values.T * weights, 0.0).T
     return np.asarray(weighted.reshape(len(intervals), -1, *values.shape[1:]).sum(axis=1))
+
+
+def _mean_inertia(intervals: ShootingIntervals, M: FloatArray) -> FloatArray:
+    return np.where(intervals.occupied[:, None, None], means_of_intervals(intervals, M), np.eye(M.shape[1]))
+
+
+def _inertia_slopes(intervals: ShootingIntervals, drawn: _DrawnMotion) -> FloatArray:
+    """Slopes ``(n,)`` of the logarithm of the logs' mean inertia by the parameters of all logs."""
+    q, v, _, u, p = drawn.motion
+    found, places = np.zeros(intervals.n_p), intervals.layout.index
+    np.add.at(found, places, inertia_slopes(intervals.model, q, v, u, p) / len(places))
+    return found
 
 
 # ---------------------------------------------------------------------- what each term changes in a fit
 
 
+def _parts(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> int:
+    """Parts of each interval over which terms are constant: samples, if the regression then fits into the memory.
+
+    Terms change with each reversal, within intervals over which the unmodelled acceleration is constant: a mean would
+    count a friction that reverses as one that is small.
+    """
+    k = fit.x.shape[1] + fit.d.shape[1]
+    n = k + len(fit.shared)
+    numbers = len(intervals) * (n_terms * (n + 2 * k) + n**2)
+    return max(
+        x for x in range(1, intervals.length + 1) if intervals.length % x == 0 and (x == 1 or x * numbers < _MOST)
+    )
+
+
 def _regression(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, accelerations: FloatArray
+    intervals: ShootingIntervals,
+    fit: Fit,
+    result: ProjectedEstimate,
+    accelerations: FloatArray,
+    inertia: FloatArray,
+    acts: BoolArray,
+    slopes: FloatArray,
 ) -> TermRegression:
-    """The regression on effects that accelerate the model, constantly over each interval: (W, n_v, K) per unit."""
+    """The regression on effects that accelerate the model, constantly over each interval: (W, n_v, K) per unit.
+
+    The estimate is that of a fit whose intervals, with this mean inertia, were split.
+    """
     prior = fit.prior.copy()
     prior[intervals.n_p :] *= _HELD
     at, n_x = linearize(intervals, replace(fit, prior=prior), weights_of(intervals, fit)), fit.x.shape[1]
     sums, k = intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights), n_x + fit.d.shape[1]
-    pushed, precision = sums.normal_matrix[:, :, n_x:k] @ accelerations, at.precision[:, :, None]
+    by_d, precision = sums.normal_matrix[:, :, n_x:k], at.precision[:, :, None]
+    pushed = by_d[:, :k] @ accelerations
     jumps = -at.slopes[:, :, n_x:k] @ accelerations[:-1]
     direct = (accelerations * pushed[:, n_x:k]).sum(axis=(0, 1)) + (precision * np.square(jumps)).sum(axis=(0, 1))
     of_z, of_s = at.by_jumps(intervals, jumps)
-    of_z, of_s = of_z + pushed[:, :k], of_s + sum_in_places(intervals, pushed[:, k:])
+    of_z, of_s = of_z + pushed, of_s + sum_of_products(intervals, by_d[:, k:], accelerations)
     # The last column is the step of all else: what an unfinished fit, or one without discrepancies, gives up.
     z, s = at.system.functional(
         np.concatenate([-of_z, at.right_z[:, :, None]], axis=2), np.concatenate([-of_s, at.right_s[:, None]], axis=1)
     )
-    effects = np.einsum("wkp,wke->pe", result.of_z, z[:, :, :-1], optimize=True) + result.of_s.T @ s[:, :-1]
-    moved = np.concatenate([z, of_logs(intervals, s)], axis=1)
-    moved[:, n_x:k, :-1] += accelerations
-    measured = _of_measurements(sums.normal_matrix, sums.gradient, moved)
-    ahead = np.concatenate([z[1:, :n_x] - at.slopes @ moved[:-1], at.jumps[:, :, None]], axis=2) * np.sqrt(precision)
-    driven = [innovations(intervals, replace(fit, d=d)) for d in (*np.moveaxis(z[:, n_x:k], 2, 0), fit.d)]
-    rows = np.concatenate([measured, np.pad(ahead, ((0, 1), (0, 0), (0, 0))), np.stack(driven, axis=2)], axis=1)
+    # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
+    parts, d = (x.reshape(len(inertia), -1, *x.shape[1:]) for x in (z, fit.d))
+    whole = np.concatenate([parts[:, 0, :n_x], parts[:, :, n_x:].mean(axis=1)], axis=1)
+    effects = np.einsum("wkp,wke->pe", result.of_z, whole[:, :, :-1], optimize=True) + result.of_s.T @ s[:, :-1]
+    forces = inertia @ whole[:, n_x:]
+    force = (inertia @ d.mean(axis=1)[:, :, None])[:, :, 0] + forces[:, :, -1]
+    moved, of_log = z.copy(), of_logs(intervals, s)
+    moved[:, n_x:, :-1] += accelerations
+    n_measured = intervals.known.reshape(len(intervals), -1).sum(axis=1).max()
+    root, residuals = _whitened(sums.normal_matrix, sums.gradient, n_measured)
+    measured = np.concatenate([root[:, :, :k] @ moved + root[:, :, k:] @ of_log, residuals[:, :, None]], axis=2)
+    jumps = z[1:, :n_x] - at.slopes[:, :, :k] @ moved[:-1] - at.slopes[:, :, k:] @ of_log[:-1]
+    ahead = np.concatenate([jumps, at.jumps[:, :, None]], axis=2) * np.sqrt(precision)
+    driven = innovations(intervals, fit, np.concatenate([np.moveaxis(z[:, n_x:k], 2, 0), fit.d[None]]))
+    rows = np.concatenate([measured, np.pad(ahead, ((0, 1), (0, 0), (0, 0))), np.moveaxis(driven, 0, 2)], axis=1)
+    rows = rows.reshape(len(inertia), -1, rows.shape[2])
     beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
     more = np.pad(beforehand, ((0, -len(beforehand) % rows.shape[1]), (0, 0)))
     rows = np.concatenate([rows, more.reshape(-1, *rows.shape[1:])])
-    return TermRegression(effects, direct, rows[:, :, -1] + rows[:, :, -2], rows[:, :, :-2])
+    left, columns = rows[:, :, -1] + rows[:, :, -2], rows[:, :, :-2]
+    return TermRegression(effects, direct, left, columns, force, forces[:, :, :-1], acts, slopes)
 
 
-def _of_measurements(H: FloatArray, gradient: FloatArray, moved: FloatArray) -> FloatArray:
-    """Changes of whitened measurements by changes of an interval's unknowns (W, n, K), and residuals: (W, n, K + 1).
+def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Slopes (W, m, n) of whitened measurements by the unknowns of each interval, and residuals (W, m).
 
-    As many rows as there are unknowns say all of the measurements: a square root of their information (W, n, n), and
-    the residuals (W, n, 1) that have their gradient.
+    As many rows as there are unknowns, or measurements, ``most``, say all of the measurements: a square root of their
+    information H (W, n, n), and residuals that have their gradient.
     """
     size = np.sqrt(np.einsum("wii->wi", H))
     size[size == 0.0] = 1.0
-    values, vectors = np.linalg.eigh(H / (size[:, :, None] * size[:, None, :]))
+    values, vectors = (x[..., -most:] for x in np.linalg.eigh(H / (size[:, :, None] * size[:, None, :])))
     known = values > _ROUNDING * values[:, -1:]
     root = np.sqrt(np.where(known, values, 0.0))
-    columns = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2)) @ moved
-    left = np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
-    return np.concatenate([columns, left[:, :, None]], axis=2)
+    slopes = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2))
+    return slopes, np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
 
 
 # ---------------------------------------------------------------------- forces, and terms that parameters equal
@@ -323,12 +389,16 @@ def _largest_forces(
     return np.asarray(np.sqrt(np.square(forces).mean(axis=0)).max(axis=1))
 
 
-def _replaceable(intervals: ShootingIntervals, motion: Sequence[FloatArray], candidates: CandidateTerms) -> BoolArray:
-    """Mask (K,) of terms that changes of the parameters equal on any motion of the model.
+@dataclass(frozen=True)
+class _DrawnMotion:
+    """Motions drawn from the log, signal by signal, so that nothing is correlated; their regressors (n, n_v, n_p)."""
 
-    Motions are drawn from the log, signal by signal, so that nothing is correlated, and velocities and inputs in
-    proportions that they need not have had.
-    """
+    motion: tuple[FloatArray, ...]
+    W: FloatArray
+
+
+def _drawn(intervals: ShootingIntervals, motion: Sequence[FloatArray]) -> _DrawnMotion:
+    """Motions of the model, with velocities and inputs in proportions that they need not have had in the log."""
     model, rng = intervals.model, np.random.default_rng(_SEED)
     n = max(_DRAWS, _PER_PARAMETER * model.n_p)
     rows, fixed = np.flatnonzero(intervals.counted), [i for four in model.quaternions for i in four]
@@ -345,7 +415,64 @@ def _replaceable(intervals: ShootingIntervals, motion: Sequence[FloatArray], can
     p = parameters[rng.choice(rows, n)]
     with np.errstate(all="ignore"):
         a, W = equations_of_rows(model, q, v, u, p)
-        h = candidates.means((q, v, a, u, p), np.ones(n), 1)
+    return _DrawnMotion((q, v, a, u, p), W)
+
+
+def _connections(model: Model, drawn: _DrawnMotion) -> list[tuple[FloatArray, FloatArray]]:
+    """Relative motions on which terms of the model depend linearly, and the equations that they drive: (n_v,) each.
+
+    A spring or a damper between two bodies, or a conductance, has a regressor ``(g' x + constant) f`` of constant g and
+    f, where x are the velocities, or coordinates of which they are the derivatives.
+    """
+    n, first_order = model.n_v, np.array([x in model.first_order for x in model.rate_names])
+    q, v, a, u, p = drawn.motion
+    W = regressors_of_rows(model, q, v, np.random.default_rng(_SEED).permutation(a), u, p)
+    known = np.isfinite(W).all(axis=(1, 2))
+    x = np.column_stack([np.ones(len(v)), v, q if model.kinematics is None else q[:, :0]])[known]
+    size, W = np.linalg.norm(x, axis=0) + _TINY, W[known].reshape(known.sum(), -1)
+    slopes = np.linalg.lstsq(x / size, W, rcond=_RANK)[0]
+    linear = np.linalg.norm(W - x / size @ slopes, axis=0) <= _RANK * np.linalg.norm(W, axis=0)
+    slopes = np.where(np.abs(slopes) > _RANK * np.abs(slopes).max(axis=0), slopes, 0.0)
+    slopes = slopes.reshape(len(size), n, -1)[:, :, linear.reshape(n, -1).all(axis=0)]
+    found = dict[tuple[float, ...], tuple[FloatArray, FloatArray]]()
+    for part in (slice(1, 1 + n), slice(1 + n, len(size))):
+        for column in np.moveaxis(slopes[part], 2, 0):
+            u, s, vt = np.linalg.svd(column)
+            if not column.any() or (s[1:] > _RANK * s[0]).any():
+                continue
+            moving = np.flatnonzero(np.abs(u[:, 0]) > _RANK)
+            if len(moving) > 1 and len(set(first_order[moving])) == 1:
+                g, f = _over_first(u[:, 0], size[part]), _over_first(vt[0], np.ones(n))
+                g = np.pad(g, (0, n - len(g)))
+                found[*g, *f] = g, f * np.sign(column[column != 0.0][0])
+    return list(found.values())
+
+
+def _over_first(unit: FloatArray, scale: FloatArray) -> FloatArray:
+    """Components of a unit vector, each over its scale, over the first of them; without what is rounding."""
+    found = np.where(np.abs(unit) > _RANK, unit / scale, 0.0)
+    return np.array([float(f"{x:.9g}") for x in found / found[found != 0.0][0]])
+
+
+def _never_determined(intervals: ShootingIntervals, found: Candidates) -> list[int]:
+    """Terms that parameters and states that nothing measures equal on any motion."""
+    model, undetermined = intervals.model, np.flatnonzero(np.isinf(found.tests.variances)).tolist()
+    measured = tuple(model.signals[k] for k in np.flatnonzero(intervals.sampled.any(axis=0)))
+    if set(model.state) <= set(measured):
+        return []
+
+    def is_ambiguous(k: int) -> bool:
+        extended = with_terms(model, [found.library.suggestion(k, 1.0, 1.0, 0.0)])
+        return any(found.library.terms[k].parameter in x.names for x in structural(extended, measured))
+
+    return [k for k in undetermined if is_ambiguous(k)]
+
+
+def _replaceable(drawn: _DrawnMotion, candidates: CandidateTerms) -> BoolArray:
+    """Mask (K,) of terms that changes of the parameters equal on any motion of the model."""
+    W, p = drawn.W, drawn.motion[4]
+    with np.errstate(all="ignore"):
+        h = candidates.means(drawn.motion, np.ones(len(W)), 1)
         scale = np.sqrt(np.square(W * p[:, None, :]).sum(axis=2, keepdims=True)) + _TINY
         W, h = (x / scale for x in (W, h))
     known = np.isfinite(W).all(axis=(1, 2)) & (np.abs(h) < _HUGE).all(axis=(1, 2))

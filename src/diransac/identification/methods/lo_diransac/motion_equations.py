@@ -94,25 +94,40 @@ def equations_of_rows(
     usable = usable[np.linalg.matrix_rank(M[usable]) == model.n_v]
     a: FloatArray = np.full((len(q), model.n_v), np.nan)
     a[usable] = -np.linalg.solve(M[usable], r[usable, :, None])[:, :, 0]
-    return a, np.asarray(_matrices(_residual_map(model)(q, v, a, u, p)[1], model.n_p))
+    return a, regressors_of_rows(model, q, v, a, u, p)
 
 
-def inertia_of_motion(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
-    """``M = dr/da`` of other parameters in every row of a motion.
+def regressors_of_rows(
+    model: Model, q: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, p: FloatArray
+) -> FloatArray:
+    """Regressors ``(N, n_v, n_p)`` of the model in every row, with any accelerations.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
-    motion : sequence of (N, ...) array
-        q, v, a, and the inputs as they act.
-    parameters : (n,) array
-
-    Returns
-    -------
-    (N, n_v, n_v) array
+    model : Model
+    q, v, a, u, p : (N, n) array
     """
-    M = _residual_map(intervals.model)(*motion[:4], _row_parameters(intervals, parameters))[2]
-    return _matrices(M, intervals.model.n_v)
+    return np.asarray(_matrices(_residual_map(model)(q, v, a, u, p)[1], model.n_p))
+
+
+def inertia_slopes(model: Model, q: FloatArray, v: FloatArray, u: FloatArray, p: FloatArray) -> FloatArray:
+    """Slopes ``(n_p,)`` of the logarithm of the inertia by each parameter: ``tr(M^-1 dM/dp) / n_v``, mean of rows.
+
+    Parameters
+    ----------
+    model : Model
+    q, v, u, p : (N, n) array
+        In every row.
+    """
+    still = np.zeros((len(q), model.n_v))
+    M = _matrices(_residual_map(model)(q, v, still, u, p)[2], model.n_v)
+    at_rest = regressors_of_rows(model, q, v, still, u, p)
+    columns = [regressors_of_rows(model, q, v, still + one, u, p) - at_rest for one in np.eye(model.n_v)]
+    slopes = np.stack(columns, axis=3).transpose(0, 2, 1, 3)
+    usable = np.flatnonzero(np.isfinite(M).all(axis=(1, 2)) & np.isfinite(slopes).all(axis=(1, 2, 3)))
+    usable = usable[np.linalg.matrix_rank(M[usable]) == model.n_v]
+    found = np.einsum("njii->j", np.linalg.solve(M[usable, None], slopes[usable]))
+    return np.asarray(found / (max(len(usable), 1) * model.n_v))
 
 
 def slopes_of_delays(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:

@@ -158,11 +158,10 @@ class NormalEquations:
         n_x, k = more.shape[1], self.right_z.shape[1]
         along = (slice(None), slice(None), *(None,) * (more.ndim - 2))
         force = self.precision[along] * np.where(intervals.linked[:, None][along], more, 0.0)
-        pulled = -np.einsum("wij,wi...->wj...", self.slopes, force, optimize=True)
         of_z = np.zeros((*self.right_z.shape, *more.shape[2:]))
-        of_z[:-1] += pulled[:, :k]
+        of_z[:-1] -= np.einsum("wij,wi...->wj...", self.slopes[:, :, :k], force, optimize=True)
         of_z[1:, :n_x] += force
-        return of_z, sum_in_places(intervals, pulled[:, k:])
+        return of_z, -sum_of_products(intervals, self.slopes[:, :, k:].swapaxes(1, 2), force)
 
 
 def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
@@ -179,6 +178,29 @@ def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
     """
     residuals, ends = intervals.simulated(fit.shared, fit.x, fit.d)
     return replace(fit, residuals=residuals, ends=ends)
+
+
+def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingIntervals, Fit]:
+    """The same motion in shorter intervals, whose unmodelled accelerations vary as much, and as slowly.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    parts : int
+        Of each interval.
+
+    Returns
+    -------
+    ShootingIntervals, Fit
+    """
+    finer, n_x = intervals.split(parts), fit.x.shape[1]
+    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
+    x = series[:, :: finer.length, :n_x].reshape(-1, n_x)
+    # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
+    slow = parts * (1.0 + fit.rho)
+    rho = (slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho)
+    return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
 
 
 def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
@@ -303,6 +325,8 @@ def of_logs(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     -------
     (W, n_own, ...) array
     """
+    if intervals.layout.is_shared:
+        return np.broadcast_to(values, (len(intervals), *values.shape))
     return np.asarray(values[_places(intervals)[intervals.log_of]])
 
 
@@ -313,6 +337,24 @@ def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     wide = np.zeros((len(values), intervals.n_shared))
     np.put_along_axis(wide, _places(intervals)[intervals.log_of[: len(values)]], values, axis=1)
     return wide
+
+
+def sum_of_products(intervals: ShootingIntervals, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Sums ``(n_s, ...)`` over intervals of ``a @ b``, in the places of their logs.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    a : (n, n_own, m) array
+        Of the shared unknowns of the first intervals' own logs.
+    b : (n, m, ...) array
+    """
+    if intervals.layout.is_shared:
+        return np.asarray(np.tensordot(a, b, ([0, 2], [0, 1])))
+    found, logs = np.zeros((intervals.n_shared, *b.shape[2:])), intervals.log_of[: len(a)]
+    for i, at in enumerate(_places(intervals)):
+        found[at] += np.tensordot(a[logs == i], b[logs == i], ([0, 2], [0, 1]))
+    return found
 
 
 def sum_in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
@@ -355,21 +397,23 @@ def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return std
 
 
-def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def innovations(intervals: ShootingIntervals, fit: Fit, d: FloatArray | None = None) -> FloatArray:
     """Unmodelled accelerations less those expected from the interval before, over their standard deviation.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
+    d : (..., W, n_v) array, optional
+        Unmodelled accelerations; those of the fit where none are given.
 
     Returns
     -------
-    (W, n_v) array
+    (..., W, n_v) array
     """
-    expected = np.zeros_like(fit.d)
-    expected[1:] = np.where(intervals.linked[:, None], fit.rho * fit.d[:-1], 0.0)
-    return np.asarray((fit.d - expected) / innovation_std(intervals, fit))
+    found = (fit.d if d is None else d).copy()
+    found[..., 1:, :] -= np.where(intervals.linked[:, None], fit.rho, 0.0) * found[..., :-1, :]
+    return np.asarray(found / innovation_std(intervals, fit))
 
 
 def _shared_blocks(

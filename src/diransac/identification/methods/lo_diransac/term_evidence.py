@@ -25,13 +25,13 @@ Frisch, Waugh 1933 (regression on what other columns leave).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 
 if TYPE_CHECKING:
@@ -43,9 +43,8 @@ _RELATIVE, _ODDS = 0.1, 1.0
 _EVIDENCE = 3.0
 # Smallest force of a suggested term over the largest one of its equation, and part of the force left that it explains.
 _SMALLEST, _SHARE = 1e-3, 0.2
-# Steps of reweighting; part of the information of a term, and of the largest force, that is rounding; rank of columns.
-_REWEIGHTED, _ROUNDING, _RANK = 3, 1e-12, 1e-8
-_TINY = 1e-300
+# Part of the information of a term that is rounding.
+_ROUNDING, _TINY = 1e-12, 1e-300
 
 
 @dataclass(frozen=True)
@@ -119,12 +118,24 @@ class TermRegression:
         Of each interval, over their standard deviations.
     columns : (W, m, K) array
         Their derivatives with respect to the coefficients.
+    force : (W, e) array
+        Unmodelled force in each equation, mean of each interval.
+    forces : (W, e, K) array
+        Its derivatives.
+    acts : (e, K) bool array
+        Equations in which each effect acts.
+    inertia : (n,) array
+        Slopes of the logarithm of the inertia by the parameters.
     """
 
     effects: FloatArray
     direct: FloatArray
     residuals: FloatArray
     columns: FloatArray
+    force: FloatArray
+    forces: FloatArray
+    acts: BoolArray
+    inertia: FloatArray
 
     def estimates(self) -> tuple[FloatArray, FloatArray]:
         """Estimate and variance ``(K,)`` of each coefficient alone; 0 and infinite where the log determines none."""
@@ -137,102 +148,70 @@ class TermRegression:
         scatter = np.square(batch_sums(scores + by_interval * found)).sum(axis=0)
         return found, np.where(determined, np.maximum(information, scatter) / np.square(information), np.inf)
 
-    def of(self, chosen: Sequence[int]) -> TermRegression:
+    def of(self, some: Sequence[int] | slice) -> TermRegression:
         """The regression on some of the effects."""
-        some = list(chosen)
-        return TermRegression(self.effects[:, some], self.direct[some], self.residuals, self.columns[:, :, some])
+        return replace(
+            self,
+            effects=self.effects[:, some],
+            direct=self.direct[some],
+            columns=self.columns[:, :, some],
+            forces=self.forces[:, :, some],
+            acts=self.acts[:, some],
+        )
 
     def beside(self, k: int) -> TermRegression:
         """The regression with effect k among all else that is estimated."""
         own = self.columns[:, :, k]
         along = own / (np.square(own).sum() + _TINY)
         shares = np.einsum("wm,wmk->k", along, self.columns)
-        left = self.residuals - own * (along * self.residuals).sum()
-        effects = self.effects - self.effects[:, k, None] * shares
-        return TermRegression(effects, self.direct, left, self.columns - own[:, :, None] * shares)
-
-    def error(self, k: int, chosen: Sequence[int]) -> float:
-        """Standard error of the coefficient of one of the chosen effects, beside the others."""
-        regression = self.of([k, *(x for x in chosen if x != k)])
-        for i in range(1, len(chosen)):
-            regression = regression.beside(i)
-        return float(np.sqrt(regression.estimates()[1][0]))
-
-
-@dataclass(frozen=True)
-class MeanForces:
-    """Means over n intervals of what the equations leave on a fitted motion, and of what could explain it.
-
-    The regression is linear where a model is affine in its parameters, however far a missing term has biased them.
-
-    Parameters
-    ----------
-    force : (n, e) array
-        Residuals r of the equations.
-    own : (n, e, m) array
-        Columns that explain r at no price: derivatives with respect to parameters, and to delays of inputs.
-    terms : (n, e, K) array
-        Candidates.
-    largest : (e,) array
-        RMS of the largest force of each equation.
-    inertia : callable
-        Derivatives (..., e, e) of the equations with respect to the accelerations, by changes (m,) of the coefficients
-        of the own columns.
-    """
-
-    force: FloatArray
-    own: FloatArray
-    terms: FloatArray
-    largest: FloatArray
-    inertia: Callable[[FloatArray], FloatArray]
-
-    def coefficients(self, chosen: Sequence[int], left: FloatArray) -> FloatArray:
-        """Least-squares coefficients ``(m + c,)`` of own columns and terms; ``left (e,)`` is the weights' inverse."""
-        columns = self._columns(chosen) / (left[:, None] + _TINY)
-        columns = columns.reshape(self.force.size, -1)
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        return np.asarray(
-            np.linalg.lstsq(columns / size, -(self.force / (left + _TINY)).ravel(), rcond=_RANK)[0] / size
+        value = self._value(k)
+        return replace(
+            self,
+            effects=self.effects - self.effects[:, k, None] * shares,
+            residuals=self.residuals + own * value,
+            columns=self.columns - own[:, :, None] * shares,
+            force=self.force + self.forces[:, :, k] * value,
+            forces=self.forces - self.forces[:, :, k, None] * shares,
         )
 
-    def left(self, chosen: Sequence[int]) -> FloatArray:
-        """RMS ``(e,)`` of the force that own columns and terms leave; equations are weighted by it."""
-        found = np.sqrt(np.square(self.force).mean(axis=0))
-        for _ in range(_REWEIGHTED):
-            found = np.maximum(found, _ROUNDING * self.largest)
-            rest = self.force + self._columns(chosen) @ self.coefficients(chosen, found)
-            found = np.sqrt(np.square(rest).mean(axis=0))
-        return np.asarray(np.maximum(found, _ROUNDING * self.largest))
+    def smaller(self, changes: FloatArray) -> FloatArray:
+        """What coefficients, and changes ``(n, ...)`` of the parameters with them, are to be divided by: 1 or more.
 
-    def _columns(self, chosen: Sequence[int]) -> FloatArray:
-        return np.concatenate([self.own, self.terms[:, :, list(chosen)]], axis=2)
-
-    def changes(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Changes ``(m,)`` of the coefficients of own columns with the terms, and coefficients ``(c,)`` of these."""
-        left, m = self.left(chosen), self.own.shape[2]
-        found = self.coefficients(chosen, left)
-        return found[:m] - self.coefficients([], left), found[m:]
-
-    def explained(self, chosen: Sequence[int], k: int) -> float:
-        """Fraction of the mean square force that term k explains after those chosen, in the equations where it acts.
-
-        A term that takes from an input would explain forces by making all of them smaller, inertia included: what is
-        left counts over the geometric mean of the factors by which the inertia changes.
+        Accelerations are linear in forces over the inertia, and in its inverse.  Where a term makes the inertia
+        smaller, the forces are smaller with it.
         """
-        acts, m = self.terms[:, :, k].any(axis=0), self.own.shape[2]
-        before, after = self.left(chosen), self.left([*chosen, k])
-        own = [self.coefficients(*x)[:m] for x in ((chosen, before), ([*chosen, k], after))]
-        determinants = [np.linalg.slogdet(self.inertia(x))[1].mean() for x in own]
-        shrunk = np.exp((determinants[1] - determinants[0]) / len(before))
-        ratio = after[acts] / (before[acts] * shrunk + _TINY)
-        return float(1.0 - np.square(ratio).mean())
+        return np.maximum(1.0 - np.tensordot(self.inertia, changes, 1), 1.0)
+
+    def joint(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Estimates and standard errors ``(c,)`` of the coefficients of the chosen effects, each beside the others."""
+        found = []
+        for k in chosen:
+            regression = self.of([k, *(x for x in chosen if x != k)])
+            for i in range(1, len(chosen)):
+                regression = regression.beside(i)
+            value, variance = regression.estimates()
+            found.append((value[0], np.sqrt(variance[0])))
+        values, errors = np.reshape(found, (-1, 2)).T
+        smaller = self.smaller(self.effects[:, list(chosen)] @ values)
+        return values / smaller, errors / smaller
+
+    def explained(self, k: int) -> float:
+        """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts."""
+        acts = self.acts[:, k]
+        left = self.force + self.forces[:, :, k] * self._value(k)
+        before, after = (np.square(x[:, acts]).mean(axis=0) for x in (self.force, left))
+        return float(1.0 - (after / (before + _TINY)).mean())
+
+    def _value(self, k: int) -> float:
+        """The coefficient of effect k alone."""
+        own = self.columns[:, :, k]
+        return -float((own * self.residuals).sum() / (np.square(own).sum() + _TINY))
 
 
 def select_terms(
-    terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression, forces: MeanForces
-) -> list[int]:
-    """Terms that explain what a fit leaves, the most probable first; empty if none does.
+    terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression
+) -> tuple[list[int], list[float]]:
+    """Terms that explain what a fit leaves, the most probable first, and the share that each explains.
 
     Parameters
     ----------
@@ -240,15 +219,15 @@ def select_terms(
     units : (K,) array
         Coefficients with which the RMS force of a term is that of the largest force of its equation.
     regression : TermRegression
-    forces : MeanForces
 
     Returns
     -------
-    list of int
+    list of int, list of float
+        Share of the mean square unmodelled force that earlier terms left, in the equations where the term acts.
     """
     parameters = np.array([x.parameter for x in terms])
     least = _EVIDENCE + np.log(max(len(terms), 1))
-    chosen, allowed = list[int](), np.ones(len(terms), bool)
+    chosen, shares, allowed = list[int](), list[float](), np.ones(len(terms), bool)
     tests = _tests(terms, units, regression)
     while allowed.any():
         odds = tests.log_odds()
@@ -256,7 +235,8 @@ def select_terms(
         if odds[k] < least:
             break
         allowed[k] = False
-        if not _is_supported(tests, forces, chosen, k, least):
+        value, (low, high), share = float(regression.joint([k])[0][0]), terms[k].bounds, regression.explained(k)
+        if not (low < value < high and abs(value) > _SMALLEST * units[k] and share > _SHARE):
             continue
         beside = regression.beside(k)
         then, others = _tests(terms, units, beside), parameters != parameters[k]
@@ -264,18 +244,10 @@ def select_terms(
         replaced = np.isfinite(then.variances) & (then.log_odds() <= 0.0)
         if not (others & replaced & (odds > odds[k] - _EVIDENCE)).any():
             chosen.append(k)
+            shares.append(share)
             allowed, tests, regression = allowed & others, then, beside
-    return chosen
+    return chosen, shares
 
 
 def _tests(terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression) -> CandidateTests:
     return CandidateTests(tuple(terms), units, *regression.estimates(), regression.effects)
-
-
-def _is_supported(tests: CandidateTests, forces: MeanForces, chosen: Sequence[int], k: int, least: float) -> bool:
-    """True if least squares on the fitted motion agrees that a term is there, possible and large."""
-    value = forces.changes([*chosen, k])[1][-1]
-    low, high = tests.terms[k].bounds
-    there = replace(tests, estimates=np.full(len(tests.terms), value)).log_odds()[k] > least
-    large = abs(value) > _SMALLEST * tests.units[k] and forces.explained(chosen, k) > _SHARE
-    return bool(low < value < high and there and large)
