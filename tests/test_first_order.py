@@ -17,6 +17,8 @@ from diransac.data.preprocessing import differentiate
 from diransac.errors import TimeLimitError
 from diransac.identification.assessment.inspection import inspect
 from diransac.identification.estimate import TIME_LIMIT
+from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.observers import observers
 from diransac.identification.structure.structural import structural
@@ -404,6 +406,23 @@ def test_the_same_seed_gives_the_same_estimate_of_an_unmeasured_state():
     log = recorded(thrust_signals(), ["z"], 0.005, 0.1)
     first, second = (dr.identify(lagged_thrust(), log, differentiate=True, seed=3) for _ in range(2))
     assert first.parameters == second.parameters
+
+
+@pytest.mark.parametrize(
+    ("signals", "velocities"),
+    [
+        (("x", "qw", "qx", "qy", "qz"), {"vx", "wx", "wy", "wz"}),
+        (("gyro_x", "speed1"), {"wx", "speed1"}),
+        (("acc_z",), {"vx", "vy", "vz", "wx", "wy", "wz"}),
+    ],
+)
+def test_signals_and_sensors_measure_velocities(signals, velocities):
+    model, n = dr.models.quadrotor(motor_lag=True, imu=True), 8
+    known = np.tile([name in signals for name in model.signals], (n, 1))
+    log = np.zeros(known.shape), known, np.zeros((n, model.n_u)), np.zeros(n, bool)
+    intervals = ShootingIntervals.of(model, ParameterLayout(model.parameters), [log], 0.01, 4, 1)
+    names = np.array(list(model.velocities))
+    assert set(names[measured_velocities(intervals)]) == velocities
 
 
 def test_a_free_scale_is_named_and_no_number_is_given_for_it():

@@ -146,6 +146,35 @@ def test_gusts_and_outliers_are_no_changes(seed):
     assert found[-1].parameters["mass"] == pytest.approx(0.249, rel=1e-3)  # what the calm flight told is kept
 
 
+def gusty_joint(seed):
+    """A joint in gusts, by Euler steps, whose torque follows a command with a lag, and its model without the torque."""
+    rng, t, x, gust = np.random.default_rng(seed), np.arange(0.0, 30.0, DT), np.zeros(3), 0.0
+    angle, command = np.empty((2, len(t)))
+    for k in range(len(t)):
+        angle[k], command[k] = x[0], 0.006 * (20.0 * np.sin(2.0 * t[k] + seed) - 20.0 * x[0] - 6.0 * x[1])
+        gust = np.exp(-DT) * gust + np.sqrt(1.0 - np.exp(-2.0 * DT)) * rng.normal()
+        for _ in range(5):
+            x = x + DT / 5.0 * np.array([x[1], x[2] / 0.006 + gust, (command[k] - x[2]) / 0.04])
+    model = dr.Model(
+        "joint",
+        {"angle": "rad"},
+        {"command": "N m"},
+        {"inertia": dr.Parameter("kg m^2", positive=True), "lag": dr.Parameter("s", positive=True)},
+        lambda q, v, a, u, p: [p.inertia * a.angle - v.torque, p.lag * a.torque + v.torque - u.command],
+        first_order={"torque": "N m"},
+    )
+    return model, dr.Log.from_arrays(t, {"angle": angle + 0.001 * rng.normal(size=len(t)), "command": command})
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_gusts_are_no_torques_that_nothing_measures(seed):
+    """Such torques would explain them with an inertia that is too small by as much as one likes."""
+    model, log = gusty_joint(seed)
+    *_, now = dr.track(model, log, start={"inertia": 0.0065, "lag": 0.045})
+    assert now.standard_errors["inertia"] < 3e-4
+    assert now.parameters["inertia"] == pytest.approx(0.006, abs=2.0 * now.standard_errors["inertia"])
+
+
 def test_change_since_an_identification_is_reported():
     result = dr.identify(MODEL, flown(800, 9), dr.LoDiransac(suggestions=False, sources=()))
     log = flown(700, 4, change=(-1.0, ("mass",), 1.3))

@@ -302,7 +302,7 @@ class Changes:
         if (usual.tau > window.expected).any() and fits.stepped(first, few, sizes, exact).evidence > step.evidence:
             step, forces = fits.nearby(first, few, sizes, exact), exact
         age = len(window) - step.first
-        larger = likeliest_forces(calm, window.expected, window.spread, {len(window), age, min(age + 1, len(window))})
+        larger = likeliest_forces(calm, window.expected, window.largest, {len(window), age, min(age + 1, len(window))})
         unchanged = {x: fits.unchanged(x) for x in (usual, forces, larger)}
         without = max(unchanged.values())
         if step.evidence < without:

@@ -123,7 +123,7 @@ def _likeliest(found: Linearization, trials: Sequence[Forces]) -> tuple[Forces, 
     return max(((x, _evidence(with_forces(found, x))) for x in trials), key=lambda x: x[1])
 
 
-def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray) -> float:
+def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArray, most: FloatArray) -> float:
     """Evidence, nats, that unmodelled accelerations gain over a model that is exact.
 
     Parameters
@@ -131,6 +131,8 @@ def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArra
     found : Linearization
     least, expected : (n_v,) array
         Sizes of the unmodelled accelerations of an exact model, and those that are expected of any other.
+    most : (n_v,) array
+        The largest ones.
 
     Returns
     -------
@@ -138,7 +140,7 @@ def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArra
         The larger one of the sizes of the fit, where they are larger than the least, and of some others.
     """
     none = np.zeros_like(least)
-    others = [Forces(expected, none), Forces(30.0 * expected, none + _GUST)]
+    others = [Forces(expected, none), Forces(np.minimum(30.0 * expected, most), none + _GUST)]
     if (found.fit.tau > least).any():
         others = [Forces(found.fit.tau, found.fit.rho)]
     return _likeliest(found, others)[1] - _likeliest(found, [Forces(least, none)])[1]

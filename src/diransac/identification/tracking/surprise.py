@@ -79,7 +79,7 @@ def free_motion(window: Window, intervals: ShootingIntervals, n: int) -> Fit:
         d=whole.d[-n:],
         residuals=whole.residuals[-n * window.length :],
         ends=whole.ends[-n:],
-        tau=window.spread,
+        tau=window.largest,
         rho=np.zeros_like(whole.rho),
         prior=_HELD * np.maximum(np.abs(whole.shared), _HELD),
         prior_mean=whole.shared,

@@ -20,6 +20,7 @@ from diransac.identification.methods.lo_diransac.scales import (
     process_sums,
     unbroken_jumps,
 )
+from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.tracking.forces import gain_of_freedom
 from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
@@ -115,6 +116,7 @@ class Window:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
         self._n_hopeless = 0
+        self._measured = np.zeros(fit.d.shape[1], bool)
         n = len(fit.x)
         self.length = stream.length // stream.parts
         self.times = stream.time(first) + self.length * stream.dt * np.arange(n)
@@ -149,6 +151,16 @@ class Window:
     def expected(self) -> FloatArray:
         """Unmodelled accelerations ``(n_v,)`` of any model of a real machine."""
         return self.setup.settings.prior_model_error * self.spread
+
+    @property
+    def largest(self) -> FloatArray:
+        """Unmodelled accelerations ``(n_v,)`` at most: those of a motion that follows its samples.
+
+        Of velocities that nothing measures, such as the speeds of rotors, they are no larger than expected.  The
+        smaller an inertia, the smaller are those of the rotors that explain a gust: the joint density of motion and
+        parameters, which the fit maximises, would grow as inertias sink.
+        """
+        return np.where(self._measured, self.spread, self.expected)
 
     def intervals(self) -> ShootingIntervals:
         """The intervals with their rows as they are now."""
@@ -220,6 +232,7 @@ class Window:
     def optimise(self) -> Linearization:
         """Steps of the fit and of its scales from the state of the window; the first linearisation."""
         intervals = self.intervals()
+        self._measured |= measured_velocities(intervals)
         weights = weights_of_free_motion(self) if is_surprised(self) else None
         first: Linearization | None = None
         damping = 0.0
@@ -236,7 +249,7 @@ class Window:
                 break
         assert first is not None
         assert self.last is not None
-        self._gained = gain_of_freedom(self.last, self.least, self.expected)
+        self._gained = gain_of_freedom(self.last, self.least, self.expected, self.largest)
         self._follow_spread(intervals)
         self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
         return first
@@ -258,14 +271,14 @@ class Window:
         noise = self.fit.noise
         # As in `search`.
         nothing = ((noise.sigma > 0.8 * self._spread) | (noise.pi > 0.8))[seen].all()
-        return bool(nothing or (self.fit.tau > self.spread).all())
+        return bool(nothing or (self.fit.tau > self.spread)[self._measured].all())
 
     def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.memory.noise))
         process = process_sums(intervals, fit, solved).total()
-        size = process.likeliest_size(fit.tau)
+        size = np.where(self._measured, process.likeliest_size(fit.tau), 0.0)
         self._found = np.square(size)
         tau = self.least if self.is_exact else np.maximum(size, self._usual_size())
         rho = np.zeros_like(tau) if self.is_exact else process.plus(self.memory.process).correlation(self.expected)

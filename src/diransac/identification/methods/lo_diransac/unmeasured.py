@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, robust_std
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -48,15 +48,36 @@ def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
     tuple of str
         In the order of the model's states.
     """
-    model = intervals.model
-    seen = set(measured_signals(intervals))
+    return _states_without(intervals.model, measured_signals(intervals))
+
+
+def measured_velocities(intervals: ShootingIntervals) -> BoolArray:
+    """Velocities that signals, derivatives of them, or sensors measure.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+
+    Returns
+    -------
+    (n_v,) bool array
+    """
+    model, seen = intervals.model, measured_signals(intervals)
+    of_sensors = [n for name in seen if name in model.sensors for n in model.sensor_arguments[name]]
+    lost = _states_without(model, (*seen, *of_sensors))
+    return np.array([n not in lost for n in model.velocities])
+
+
+@lru_cache(maxsize=64)
+def _states_without(model: Model, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the states that are not among some names, and whose derivatives are not."""
+    seen = set(names)
     lost = {name for chain in model.chains if seen.isdisjoint(chain) for name in chain}
     if model.kinematics is not None:
         lost -= _velocities_behind(model, tuple(n for n in model.coordinates if n in seen))
     return tuple(n for n in model.state if n in lost)
 
 
-@lru_cache(maxsize=64)
 def _velocities_behind(model: Model, coordinates: tuple[str, ...]) -> set[str]:
     """Names of the velocities on which the rates of some coordinates depend, by the kinematics."""
     assert model.kinematics is not None
