@@ -46,6 +46,7 @@ from diransac.identification.methods.lo_diransac.term_evidence import (
     select_terms,
     weighted,
 )
+from diransac.identification.methods.lo_diransac.unmeasured import measured_signals, unmeasured_states
 from diransac.identification.structure.candidate_terms import RelativeMotion, TermLibrary, candidate_terms
 from diransac.identification.structure.lacking_terms import PossibleTerm, with_terms
 from diransac.identification.structure.structural import structural
@@ -456,16 +457,15 @@ def _over_first(unit: FloatArray, scale: FloatArray) -> FloatArray:
 
 def _never_determined(intervals: ShootingIntervals, found: Candidates) -> list[int]:
     """Terms that parameters and states that nothing measures equal on any motion."""
-    model, undetermined = intervals.model, np.flatnonzero(np.isinf(found.tests.variances)).tolist()
-    measured = tuple(model.signals[k] for k in np.flatnonzero(intervals.sampled.any(axis=0)))
-    if set(model.state) <= set(measured):
+    if not unmeasured_states(intervals):
         return []
 
     def is_ambiguous(k: int) -> bool:
-        extended = with_terms(model, [found.library.suggestion(k, 1.0, 1.0, 0.0)])
-        return any(found.library.terms[k].parameter in x.names for x in structural(extended, measured))
+        extended = with_terms(intervals.model, [found.library.suggestion(k, 1.0, 1.0, 0.0)])
+        ambiguous = structural(extended, measured_signals(intervals))
+        return any(found.library.terms[k].parameter in x.names for x in ambiguous)
 
-    return [k for k in undetermined if is_ambiguous(k)]
+    return [k for k in np.flatnonzero(np.isinf(found.tests.variances)).tolist() if is_ambiguous(k)]
 
 
 def _replaceable(drawn: _DrawnMotion, candidates: CandidateTerms) -> BoolArray:
