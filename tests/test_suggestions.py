@@ -9,6 +9,7 @@ import pytest
 
 import diransac as dr
 from command_line import run
+from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes
 from diransac.identification.methods.lo_diransac.term_evidence import TermRegression, select_terms
 from diransac.identification.structure.candidate_terms import CandidateTerm, RelativeMotion, candidate_terms
 from diransac.identification.structure.lacking_terms import INPUT_CHANGES, with_terms
@@ -450,6 +451,28 @@ def test_dry_friction_between_two_bodies_is_suggested(friction):
     assert added == ({"coulomb_x_y"} if friction else set())
     assert found.parameters.get("coulomb_x_y", 0.0) == pytest.approx(friction, rel=0.03)
     assert found.parameters["c"] == pytest.approx(0.6, rel=0.03)
+
+
+def test_slopes_of_the_inertia_are_those_of_its_logarithm():
+    model, rng = crane(), np.random.default_rng(0)
+    q, v, u = (rng.standard_normal((50, n)) for n in (2, 2, 1))
+    arguments = model.residual.sx_in()
+    inertia = ca.Function("inertia", arguments, [ca.jacobian(model.residual(*arguments), arguments[2])])
+
+    def logarithm(p):
+        rows = [np.array(inertia(*x, [0.0, 0.0], w, p)) for *x, w in zip(q, v, u, strict=True)]
+        return np.mean([np.linalg.slogdet(M)[1] for M in rows]) / 2.0
+
+    p = np.array([3.0, 0.7, 0.2])
+    found = inertia_slopes(model, q, v, u, np.broadcast_to(p, (50, 3)))
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        assert found[k] == pytest.approx((logarithm(p + step) - logarithm(p - step)) / 2e-6, abs=1e-6)
+
+
+def test_the_same_log_has_the_same_suggestions(with_dry_friction, result):
+    again = dr.identify(result.model, with_dry_friction, differentiate=True)
+    assert again.suggestions == result.suggestions
+    assert again.structure == result.structure
 
 
 def test_suggestions_can_be_switched_off(with_dry_friction):

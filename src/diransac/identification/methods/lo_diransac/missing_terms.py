@@ -282,8 +282,10 @@ def _mean_inertia(intervals: ShootingIntervals, M: FloatArray) -> FloatArray:
 def _inertia_slopes(intervals: ShootingIntervals, drawn: _DrawnMotion) -> FloatArray:
     """Slopes ``(n,)`` of the logarithm of the logs' mean inertia by the parameters of all logs."""
     q, v, _, u, p = drawn.motion
-    found, places = np.zeros(intervals.n_p), intervals.layout.index
-    np.add.at(found, places, inertia_slopes(intervals.model, q, v, u, p) / len(places))
+    places, slopes = intervals.layout.index, inertia_slopes(intervals.model, q, v, u, p)
+    found: FloatArray = np.zeros(intervals.n_p)
+    for one in places:
+        found[one] += slopes / len(places)
     return found
 
 
