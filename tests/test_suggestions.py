@@ -9,6 +9,7 @@ import pytest
 
 import diransac as dr
 from command_line import run
+from diransac.identification.methods.lo_diransac.missing_terms import connections
 from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes
 from diransac.identification.methods.lo_diransac.term_evidence import TermRegression, select_terms
 from diransac.identification.structure.candidate_terms import CandidateTerm, RelativeMotion, candidate_terms
@@ -451,6 +452,50 @@ def test_dry_friction_between_two_bodies_is_suggested(friction):
     assert added == ({"coulomb_x_y"} if friction else set())
     assert found.parameters.get("coulomb_x_y", 0.0) == pytest.approx(friction, rel=0.03)
     assert found.parameters["c"] == pytest.approx(0.6, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        (
+            dr.Model(
+                "gears",
+                {"x": "m", "angle": "rad", "z": "m"},
+                {"force": "N"},
+                dict.fromkeys(["mass", "damping", "stiffness", "drag"], dr.Parameter()),
+                lambda q, v, a, u, p: [
+                    p.mass * a.x - p.damping * (0.05 * v.angle - v.x) - u.force,
+                    a.angle + 0.05 * p.damping * (0.05 * v.angle - v.x) + p.stiffness * (q.angle - 2.0 * q.z - 1.0),
+                    a.z - 2.0 * p.stiffness * (q.angle - 2.0 * q.z - 1.0) + p.drag * v.z,
+                ],
+            ),
+            [([1.0, -0.05, 0.0], [1.0, -0.05, 0.0]), ([0.0, 1.0, -2.0], [0.0, 1.0, -2.0])],
+        ),
+        (
+            dr.Model(
+                "rooms",
+                {},
+                {"heat": "W"},
+                dict.fromkeys(["conductance", "loss"], dr.Parameter()),
+                lambda q, v, a, u, p: [
+                    a.warm + p.conductance * (v.warm - v.cold) / 3.0 - u.heat,
+                    a.cold - p.conductance * (v.warm - v.cold) / 6.0 + p.loss * v.cold,
+                ],
+                first_order={"warm": "K", "cold": "K"},
+            ),
+            [([1.0, -1.0], [1.0, -0.5])],
+        ),
+        (dr.models.planar_rotorcraft(), []),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_springs_dampers_and_conductances_connect(model, expected):
+    rng = np.random.default_rng(0)
+    rows = (rng.standard_normal((200, n)) for n in (model.n_q, model.n_v, model.n_v, model.n_u))
+    found = connections(model, *rows, np.ones((200, model.n_p)))
+    assert len(found) == len(expected)
+    for pair, known in zip(found, expected, strict=True):
+        np.testing.assert_allclose(pair, known, atol=1e-9)
 
 
 def test_slopes_of_the_inertia_are_those_of_its_logarithm():

@@ -244,7 +244,7 @@ class _Expression:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where terms act: on a coordinate or a velocity, or between several.
+    """A place of terms: a coordinate or a velocity, or between several.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ class _Maker:
         return self.place(RelativeMotion(one, sign * one, float(self.speeds[i])))
 
     def place(self, motion: RelativeMotion) -> _Place:
-        """Where terms of a motion act."""
+        """The place of the terms of a motion."""
         model, (q, v, *_), names = self.model, self.symbols, self.model.rate_names
         used = [names[k] for k in np.flatnonzero(motion.velocities)]
         speed = _sum(motion.velocities, v, model.velocities, names, "v")

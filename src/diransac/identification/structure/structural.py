@@ -34,7 +34,8 @@ from diransac.model import Model, Parameter
 _HALF_RANGE = 10.0
 
 
-# Singular value over the largest below which it is zero, of dr/dp and of sensitivities, whose sizes differ by decades.
+# Singular value over the largest below which it is zero: of dr/dp, and of sensitivities, whose sizes differ by decades
+# and which are rounded to a few 1e-12.
 _RANK, _RANK_OF_OUTPUTS = 1e-9, 1e-11
 Ranges = tuple[tuple[str, float, float], ...]
 """Smallest and largest value of states and inputs, by name."""

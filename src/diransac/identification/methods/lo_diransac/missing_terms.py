@@ -67,7 +67,7 @@ _KEPT = 1e-3
 _EQUIVALENT = 1e-6
 # Draws of a motion, and as many per parameter and equation; the seed.
 _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
-# Relative size of what is none in regressors that are linear, and in vectors of unit length.
+# Relative residual up to which a regressor is linear; component of a unit vector that is rounding.
 _RANK = 1e-7
 # Factor of the prior of discrepancies that holds them at zero.
 _HELD = 1e-3
@@ -230,7 +230,7 @@ def possible_terms(
     own = np.where(np.isfinite(own), own, np.inf)
     # With the term, least squares, simulation error and the fit would agree: what the fit has then is the estimate's.
     changes = tests.effects * means
-    shifts = changes / found.regression.smaller(changes) + (result.of_fit - result.parameters)[:, None]
+    shifts = changes / found.regression.divisor(changes) + (result.of_fit - result.parameters)[:, None]
     added = weights * (np.square(tests.effects) * variances + np.square(shifts))
     kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
     return tuple(
@@ -256,7 +256,7 @@ def _library(
     sizes = np.stack([np.sqrt(np.square(inputs).mean(axis=0)), np.quantile(np.abs(inputs), _MOSTLY, axis=0)], axis=1)
     relative = [
         RelativeMotion(rates, forces, float(np.sqrt(np.square(velocities @ rates).mean())))
-        for rates, forces in _connections(intervals.model, drawn)
+        for rates, forces in connections(intervals.model, *drawn.motion)
     ]
     return candidate_terms(intervals.model, np.sqrt(np.square(velocities).mean(axis=0)), sizes, relative, library)
 
@@ -421,14 +421,26 @@ def _drawn(intervals: ShootingIntervals, motion: Sequence[FloatArray]) -> _Drawn
     return _DrawnMotion((q, v, a, u, p), W)
 
 
-def _connections(model: Model, drawn: _DrawnMotion) -> list[tuple[FloatArray, FloatArray]]:
+def connections(
+    model: Model, q: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, p: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
     """Relative motions on which terms of the model depend linearly, and the equations that they drive: (n_v,) each.
 
     A spring or a damper between two bodies, or a conductance, has a regressor ``(g' x + constant) f`` of constant g and
     f, where x are the velocities, or coordinates of which they are the derivatives.
+
+    Parameters
+    ----------
+    model : Model
+    q, v, a, u, p : (N, n) array
+        Rows in which nothing is correlated.
+
+    Returns
+    -------
+    list of ((n_v,) array, (n_v,) array)
+        The first component of g is 1, that of f 1 or -1.
     """
     n, first_order = model.n_v, np.array([x in model.first_order for x in model.rate_names])
-    q, v, a, u, p = drawn.motion
     W = regressors_of_rows(model, q, v, np.random.default_rng(_SEED).permutation(a), u, p)
     known = np.isfinite(W).all(axis=(1, 2))
     x = np.column_stack([np.ones(len(v)), v, q if model.kinematics is None else q[:, :0]])[known]

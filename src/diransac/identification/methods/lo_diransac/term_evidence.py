@@ -174,8 +174,8 @@ class TermRegression:
             forces=self.forces - self.forces[:, :, k, None] * shares,
         )
 
-    def smaller(self, changes: FloatArray) -> FloatArray:
-        """What coefficients, and changes ``(n, ...)`` of the parameters with them, are to be divided by: 1 or more.
+    def divisor(self, changes: FloatArray) -> FloatArray:
+        """Divisor, 1 or more, of coefficients and of the changes ``(n, ...)`` of the parameters with them.
 
         Accelerations are linear in forces over the inertia, and in its inverse.  Where a term makes the inertia
         smaller, the forces are smaller with it.
@@ -192,8 +192,8 @@ class TermRegression:
             value, variance = regression.estimates()
             found.append((value[0], np.sqrt(variance[0])))
         values, errors = np.reshape(found, (-1, 2)).T
-        smaller = self.smaller(self.effects[:, list(chosen)] @ values)
-        return values / smaller, errors / smaller
+        divisor = self.divisor(self.effects[:, list(chosen)] @ values)
+        return values / divisor, errors / divisor
 
     def explained(self, k: int) -> float:
         """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts."""
