@@ -8,7 +8,13 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, weighted
+from diransac.identification.methods.lo_diransac import term_evidence
+from diransac.identification.methods.lo_diransac.term_evidence import (
+    CandidateTests,
+    TermRegression,
+    posterior,
+    probabilities,
+)
 from diransac.identification.structure.candidate_terms import candidate_terms
 from diransac.identification.structure.lacking_terms import PossibleTerm, mixture_intervals
 
@@ -22,18 +28,17 @@ def line(rng, n=40, noise=0.3):
 
 
 def candidates_of_line(x, terms, y, noise, kinds):
-    """What the package is given: estimates, variances and effects of each term beside the slope."""
-    left = terms - np.outer(x, x @ terms) / (x @ x)
-    information = np.square(left).sum(axis=0) / noise**2
+    """What the package is given: whitened columns of each term beside the slope, and residuals."""
     known = candidate_terms(dr.models.underwater_vehicle(), np.ones(1), np.ones((1, 2)))
     chosen = tuple(next(t for t in known.terms if t.kind == kind) for kind in kinds)
-    return CandidateTests(
-        terms=chosen,
-        units=np.array([2.0, 3.0]),
-        estimates=(left.T @ y) / np.square(left).sum(axis=0),
-        variances=1.0 / information,
-        effects=-(x @ terms)[None, :] / (x @ x),
-    )
+    columns = -(terms - np.outer(x, x @ terms) / (x @ x)) / noise
+    residuals = (y - x * (x @ y) / (x @ x)) / noise
+    forces = np.zeros((len(x), 1, 2))
+    regression = TermRegression(
+        -(x @ terms)[None, :] / (x @ x), np.square(columns).sum(axis=0), residuals[:, None], columns[:, None, :],
+        forces[:, :, 0], forces, np.ones((1, 2), bool), np.zeros(1),
+    )  # fmt: skip
+    return CandidateTests(chosen, np.array([2.0, 3.0]), regression, relative=0.2, odds=0.6)
 
 
 def by_brute_force(x, terms, y, noise, s, prior, probability):
@@ -55,20 +60,39 @@ def by_brute_force(x, terms, y, noise, s, prior, probability):
 
 
 @pytest.mark.parametrize("kinds", [("constant force", "quadratic drag"), ("Stribeck friction", "Stribeck friction")])
-def test_mixture_is_the_posterior_of_a_linear_gaussian_model(kinds):
+def test_mixture_is_the_posterior_of_a_linear_gaussian_model(kinds, monkeypatch):
     x, terms, y, noise = line(np.random.default_rng(1))
+    monkeypatch.setattr(term_evidence, "batch_sums", np.zeros_like)  # white noise of a known size
     tests = candidates_of_line(x, terms, y, noise, kinds)
-    weights, means, variances = weighted(tests, relative=0.2, odds=0.6)
+    sets = tests.sets()
+    weights = probabilities(sets)
     # Terms of one kind and place share its odds.
     prior = [0.6, 0.6] if len(set(kinds)) == 2 else [0.3, 0.3]
     exact, interval = by_brute_force(x, terms, y, noise, 0.2 * tests.units, prior, 0.9)
     assert np.allclose(weights, exact, rtol=1e-3)
     value, error = np.array([x @ y / (x @ x)]), np.array([noise / np.sqrt(x @ x)])
-    effects = tests.effects.T
-    found = mixture_intervals(
-        value, error, weights, effects * means[:, None], effects**2 * variances[:, None], 0.9, 1.6448536269514722
-    )
+    effects = tests.regression.effects.T
+    means, variances = np.array([one.means for one in sets]), np.array([one.covariance[0] for one in sets])
+    found = mixture_intervals(value, error, weights, effects * means, effects**2 * variances, 0.9, 1.6448536269514722)
     assert np.allclose(found[0], interval, atol=4e-3)
+
+
+def test_bayes_factor_of_two_coefficients_is_their_integral():
+    """And means and covariance are those of the posterior density, on a grid."""
+    rng = np.random.default_rng(4)
+    columns, y, prior = rng.standard_normal((12, 2)), rng.standard_normal(12), np.array([0.3, 0.8])
+    columns[:, 1] += columns[:, 0]
+    a, b = np.meshgrid(np.linspace(-5.0, 5.0, 1001), np.linspace(-8.0, 8.0, 1601), indexing="ij")
+    theta = np.stack([a.ravel(), b.ravel()])
+    likelihood = np.exp(-0.5 * (np.square(y[:, None] - columns @ theta).sum(axis=0) - y @ y))
+    density = np.exp(-0.5 * (theta**2 / prior[:, None]).sum(axis=0)) / (2.0 * np.pi * np.sqrt(prior.prod()))
+    mass = likelihood * density * 1e-4
+    factor, means, covariance = posterior(columns.T @ columns, columns.T @ y, prior)
+    assert factor == pytest.approx(np.log(mass.sum()), abs=1e-4)
+    exact = theta @ mass / mass.sum()
+    assert means == pytest.approx(exact, abs=1e-4)
+    spread = (theta - exact[:, None]) * mass / mass.sum() @ (theta - exact[:, None]).T
+    assert covariance == pytest.approx(spread, abs=1e-4)
 
 
 def test_interval_without_terms_is_that_of_the_complete_model():
@@ -170,7 +194,7 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     kept = []
 
     def recorded(candidates, *_):
-        kept.append(candidates.tests)
+        kept.append(candidates.tests())
         return ()
 
     monkeypatch.setattr(method, "possible_terms", recorded)
@@ -186,23 +210,22 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     full = dr.identify(wide, log, differentiate=True)
     tests = kept[0]
     k = next(i for i, x in enumerate(tests.terms) if x.kind == "stiffness")
-    assert tests.estimates[k] == pytest.approx(
-        full.parameters["stiffness"], abs=0.1 * full.standard_errors["stiffness"]
-    )
-    assert np.sqrt(tests.variances[k]) == pytest.approx(full.standard_errors["stiffness"], rel=0.25)
+    estimate, variance = (x[k] for x in tests.regression.estimates())
+    assert estimate == pytest.approx(full.parameters["stiffness"], abs=0.1 * full.standard_errors["stiffness"])
+    assert np.sqrt(variance) == pytest.approx(full.standard_errors["stiffness"], rel=0.25)
     change = [full.parameters[n] - plain.parameters[n] for n in CART.parameters]
-    assert tests.effects[:, k] * tests.estimates[k] == pytest.approx(
+    assert tests.regression.effects[:, k] * estimate == pytest.approx(
         change, abs=0.05 * max(full.standard_errors[n] for n in CART.parameters)
     )
     covariance = full.covariance
-    assert tests.effects[:, k] == pytest.approx(covariance[:2, 2] / covariance[2, 2], rel=0.1)
+    assert tests.regression.effects[:, k] == pytest.approx(covariance[:2, 2] / covariance[2, 2], rel=0.1)
 
 
 def test_terms_that_the_model_has_are_no_candidates(monkeypatch):
     from diransac.identification.methods.lo_diransac import method
 
     kept = []
-    monkeypatch.setattr(method, "possible_terms", lambda candidates, *_: kept.append(candidates.tests) or ())
+    monkeypatch.setattr(method, "possible_terms", lambda candidates, *_: kept.append(candidates.tests()) or ())
     identified(cart_log(4))
     kinds = {x.kind for x in kept[0].terms}
     # A gain of the only input is one of all parameters: no motion separates them.

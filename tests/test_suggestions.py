@@ -11,7 +11,7 @@ import diransac as dr
 from command_line import run
 from diransac.identification.methods.lo_diransac.missing_terms import connections
 from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes
-from diransac.identification.methods.lo_diransac.term_evidence import TermRegression, select_terms
+from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, TermRegression
 from diransac.identification.structure.candidate_terms import CandidateTerm, RelativeMotion, candidate_terms
 from diransac.identification.structure.lacking_terms import INPUT_CHANGES, with_terms
 from user_models import tumbling
@@ -75,7 +75,8 @@ def select(made, whitened=None, parameters=None, bounds=None, largest=1.0):
         CandidateTerm(f"kind {k}", "q", "q", "", "", f"p{x}", "", ca.SX(1), bounds.get(k, (-np.inf, np.inf)))
         for k, x in enumerate(parameters)
     ]
-    return select_terms(terms, units_of(made, largest), whitened or regression(made))[0]
+    found = CandidateTests(tuple(terms), units_of(made, largest), whitened or regression(made)).selected()
+    return [k for one in found for k in one]
 
 
 def autocorrelated(rng, n, rho=0.9):
@@ -111,6 +112,20 @@ def test_planted_terms_are_found_with_their_coefficients_within_five_standard_er
         for k, value, error in zip(found, *regression(made).joint(found), strict=True):
             assert abs(value - {6: 0.8, 9: -0.5}[k]) < 5.0 * error
         assert 0.6 < regression(made).explained(6) <= 1.0
+
+
+def test_two_terms_that_hide_each_other_are_found_together():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        made = made_of(rng, force=0.3 * rng.standard_normal((120, 2)))
+        terms, differs = made.terms.copy(), rng.standard_normal(120)
+        terms[:, 0, 6] = terms[:, 0, 4] + 0.1 * differs
+        made = replace(made, terms=terms, force=made.force + 8.0 * (terms[:, :, 4] - terms[:, :, 6]))
+        whitened = regression(made)
+        assert np.abs(whitened.estimates()[0][[4, 6]]).max() < 0.8
+        assert sorted(select(made, largest=80.0)) == [4, 6]
+        values, errors = whitened.joint([4, 6])
+        assert np.all(np.abs(values - [-8.0, 8.0]) < 5.0 * errors)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])

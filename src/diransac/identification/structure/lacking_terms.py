@@ -1,9 +1,9 @@
 """Terms that a model lacks: suggested ones, models with them, and the uncertainty of parameters by possible ones.
 
-Either the model is complete, or it lacks one of the terms that the log does not exclude, each with its weight.  Given
-the coefficient of a term, the estimate is another one, by ``g`` times the coefficient.  The distribution of a
-parameter is therefore a mixture of normal ones: ``N(p, C)`` of the complete model, and ``N(p + g m, C + v g^2)`` with a
-term whose coefficient has the mean m and the variance v.
+Either the model is complete, or it lacks one of the terms that the log does not exclude, or two of them, each with its
+weight.  Given the coefficient of a term, the estimate is another one, by ``g`` times the coefficient.  The distribution
+of a parameter is therefore a mixture of normal ones: ``N(p, C)`` of the complete model, and ``N(p + g m, C + v g^2)``
+with a term whose coefficient has the mean m and the variance v.
 
 References
 ----------
@@ -95,7 +95,7 @@ def unit_over(force: str, unit: str) -> str:
 
 @dataclass(frozen=True)
 class PossibleTerm:
-    """A term that the model may lack: its evidence, its coefficient, and its effect on the parameters.
+    """A term that the model may lack, or two: the evidence, the coefficient, and the effect on the parameters.
 
     Parameters
     ----------
@@ -110,11 +110,11 @@ class PossibleTerm:
     variance : float
         Of its coefficient, if the model lacks the term.
     effects : mapping of str to float
-        Change of each parameter per unit of the coefficient.
+        Change of each parameter per unit of the coefficient; of two terms, that with the variance by both.
     shifts : mapping of str to float
         Parameters if the model lacks the term, less those of the estimate.
     name : str, optional
-        Name in an engineer's words, such as ``dry friction of x``.
+        Name in an engineer's words, such as ``dry friction of x``; of two terms, both names.
     """
 
     kind: str
@@ -285,7 +285,7 @@ class Suggestion:
     unit : str
         Unit of the coefficient; empty if unknown.
     explained : float
-        Fraction of the mean square unmodelled force of the equation, after earlier suggestions, that the term explains.
+        Fraction that the term explains of the mean square unmodelled force that other suggestions leave.
     code : str
         Python code, with CasADi as ``ca``: a summand of the residual with its sign, or what replaces the input.
     term : mapping of str to object

@@ -43,19 +43,18 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
 from diransac.identification.methods.lo_diransac.term_evidence import (
     CandidateTests,
     TermRegression,
-    select_terms,
-    weighted,
+    probabilities,
 )
 from diransac.identification.methods.lo_diransac.unmeasured import measured_signals, unmeasured_states
 from diransac.identification.structure.candidate_terms import RelativeMotion, TermLibrary, candidate_terms
-from diransac.identification.structure.lacking_terms import PossibleTerm, with_terms
+from diransac.identification.structure.lacking_terms import PossibleTerm, name_of_term, with_terms
 from diransac.identification.structure.structural import structural
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.structure.candidate_terms import CandidateTerms
+    from diransac.identification.structure.candidate_terms import CandidateTerm, CandidateTerms
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Model
 
@@ -109,11 +108,12 @@ class Candidates:
             self.inertia,
         )
 
-    @property
-    def tests(self) -> CandidateTests:
-        """Tests of the terms one by one, at the delays of the fit."""
-        alone = self.regression.of(slice(len(self.library)))
-        return CandidateTests(self.library.terms, self.units, *alone.estimates(), alone.effects)
+    def tests(self, *, beside_delays: bool = False) -> CandidateTests:
+        """Tests of the terms at the delays of the fit, or beside changes of them."""
+        regression, n = self.regression, len(self.library)
+        if beside_delays:
+            regression = regression.beside(*range(n, regression.columns.shape[2]))
+        return CandidateTests(self.library.terms, self.units, regression.of(slice(n)))
 
 
 @dataclass(frozen=True)
@@ -187,23 +187,18 @@ def missing_terms(found: Candidates) -> MissingTerms:
     -------
     MissingTerms
     """
-    terms, beside_delays = found.library.terms, found.regression
-    for k in range(len(terms), found.regression.columns.shape[2]):
-        beside_delays = beside_delays.beside(k)
-    regression = beside_delays.of(slice(len(terms)))
-    chosen, shares = select_terms(terms, found.units, regression)
+    tests = found.tests(beside_delays=True)
+    regression, sets = tests.regression, tests.selected()
+    chosen, first = [k for one in sets for k in one], [k for one in sets[:1] for k in one]
     values, errors = regression.joint(chosen)
-    suggestions = tuple(
-        found.library.suggestion(k, float(value), float(error), share)
-        for k, value, error, share in zip(chosen, values, errors, shares, strict=True)
-    )
-    left = regression
-    for k in chosen:
-        left = left.beside(k)
-    explained = regression.force - left.force
+    suggestions = []
+    for i, (k, value, error) in enumerate(zip(chosen, values.tolist(), errors.tolist(), strict=True)):
+        share = regression.beside(*chosen[:i], *chosen[i + 1 :]).explained(k)
+        suggestions.append(found.library.suggestion(k, value, error, share))
+    explained = regression.force - regression.beside(*chosen).force
     accelerations = np.linalg.solve(found.inertia, explained[:, :, None])[:, :, 0]
-    change = regression.effects[:, chosen[:1]] @ regression.joint(chosen[:1])[0]
-    return MissingTerms(suggestions, change, np.asarray(accelerations))
+    change = regression.effects[:, first] @ regression.joint(first)[0]
+    return MissingTerms(tuple(suggestions), change, np.asarray(accelerations))
 
 
 def possible_terms(
@@ -224,28 +219,42 @@ def possible_terms(
     -------
     tuple of PossibleTerm
     """
-    tests = found.tests
-    weights, means, variances = weighted(tests)
+    tests = found.tests()
+    sets, regression = tests.sets(), tests.regression
     own = np.diag(covariance)
     own = np.where(np.isfinite(own), own, np.inf)
-    # With the term, least squares, simulation error and the fit would agree: what the fit has then is the estimate's.
-    changes = tests.effects * means
-    shifts = changes / found.regression.divisor(changes) + (result.of_fit - result.parameters)[:, None]
-    added = weights * (np.square(tests.effects) * variances + np.square(shifts))
-    kept = np.flatnonzero((added > _KEPT * own[:, None]).any(axis=0) & np.isfinite(added).all(axis=0))
-    return tuple(
-        PossibleTerm(
-            (term := tests.terms[k]).kind,
-            term.place,
-            term.formula,
-            float(weights[k]),
-            float(variances[k]),
-            dict(zip(names, tests.effects[:, k].tolist(), strict=True)),
-            dict(zip(names, shifts[:, k].tolist(), strict=True)),
-            term.name,
-        )
-        for k in kept[np.argsort(-weights[kept], kind="stable")]
-    )
+    possible = list[PossibleTerm]()
+    for one, weight in zip(sets, probabilities(sets).tolist(), strict=True):
+        effects = regression.effects[:, list(one.members)]
+        change = effects @ one.means
+        # With the terms, least squares, simulation error and the fit would agree: what the fit has is the estimate's.
+        shifts = change / regression.divisor(change) + result.of_fit - result.parameters
+        variances = np.einsum("nk,kl,nl->n", effects, one.covariance, effects)
+        added = weight * (variances + np.square(shifts))
+        if (added > _KEPT * own).any() and np.isfinite(added).all():
+            # By the square of its effects, over the variances of the parameters, the largest of a pair.
+            of_each = np.square(effects) * (np.diag(one.covariance) + np.square(one.means)) / own[:, None]
+            k = int(np.argmax(of_each.sum(axis=0)))
+            term, variance = tests.terms[one.members[k]], float(one.covariance[k, k])
+            beside = [tests.terms[x] for x in one.members if x != one.members[k]]
+            per_unit = np.sign(effects[:, k]) * np.sqrt(variances / variance)
+            possible.append(
+                PossibleTerm(
+                    term.kind,
+                    term.place,
+                    "" if beside else term.formula,
+                    weight,
+                    variance,
+                    dict(zip(names, per_unit.tolist(), strict=True)),
+                    dict(zip(names, shifts.tolist(), strict=True)),
+                    " and ".join(_name(x) for x in (term, *beside)) if beside else term.name,
+                )
+            )
+    return tuple(sorted(possible, key=lambda x: -x.weight))
+
+
+def _name(term: CandidateTerm) -> str:
+    return term.name or name_of_term(term.kind, term.place, term.formula, "")
 
 
 def _library(
@@ -479,7 +488,8 @@ def _never_determined(intervals: ShootingIntervals, found: Candidates) -> list[i
         ambiguous = structural(extended, measured_signals(intervals))
         return any(found.library.terms[k].parameter in x.names for x in ambiguous)
 
-    return [k for k in np.flatnonzero(np.isinf(found.tests.variances)).tolist() if is_ambiguous(k)]
+    _, variances = found.tests().regression.estimates()
+    return [k for k in np.flatnonzero(np.isinf(variances)).tolist() if is_ambiguous(k)]
 
 
 def _replaceable(drawn: _DrawnMotion, candidates: CandidateTerms) -> BoolArray:

@@ -1,4 +1,4 @@
-"""Evidence for terms that a model may lack: weights of possible terms, and selection of suggested ones.
+"""Evidence for terms that a model may lack: probabilities of possible terms, and selection of suggested ones.
 
 A term ``theta h`` of the equations changes what a fit leaves, residual by residual, while all else is estimated with
 it: a linear regression of whitened residuals on the coefficients.  Its estimates, and their variances, which count what
@@ -13,8 +13,9 @@ of two normal distributions,
 
 A term that the log excludes has a small one, as the prior was much wider than what the log leaves of it (Occam's
 factor).  One that the log does not show either way has BF = 1 and the variance of its prior: if it is correlated with a
-parameter, that is uncertain.  One whose odds exceed what the choice among all terms gives by chance is suggested, and
-the next is sought beside it (forward selection).
+parameter, that is uncertain.  Where the model lacks two terms, each may explain nothing alone: pairs compete with
+single terms, by the Bayes factor of two coefficients.  A term or a pair whose odds exceed what the choice among all
+gives by chance is suggested, and the next is sought beside it (forward selection).
 
 References
 ----------
@@ -31,7 +32,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 
 if TYPE_CHECKING:
@@ -43,65 +44,8 @@ _RELATIVE, _ODDS = 0.1, 1.0
 _EVIDENCE = 3.0
 # Smallest force of a suggested term over the largest one of its equation, and part of the force left that it explains.
 _SMALLEST, _SHARE = 1e-3, 0.2
-# Part of the information of a term that is rounding.
-_ROUNDING, _TINY = 1e-12, 1e-300
-
-
-@dataclass(frozen=True)
-class CandidateTests:
-    """Tests of K candidates at a fit, before any prior.
-
-    Parameters
-    ----------
-    terms : tuple of CandidateTerm
-    units : (K,) array
-        Coefficients with which the RMS force of a term is that of the largest force of its equation.
-    estimates, variances : (K,) array
-        Of the coefficients; 0 and infinite where the log does not determine one.
-    effects : (n, K) array
-        Change of the parameters per unit of each coefficient.
-    """
-
-    terms: tuple[CandidateTerm, ...]
-    units: FloatArray
-    estimates: FloatArray
-    variances: FloatArray
-    effects: FloatArray
-
-    def log_odds(self, relative: float = _RELATIVE, odds: float = _ODDS) -> FloatArray:
-        """Logarithms ``(K,)`` of the posterior odds of each term against the complete model."""
-        places = [(x.kind, x.place) for x in self.terms]
-        of_kind = Counter(places)
-        prior = np.log([odds / of_kind[x] for x in places])
-        ratio = np.square(relative * self.units) / self.variances
-        z = np.square(self.estimates) / np.where(np.isfinite(self.variances), self.variances, 1.0)
-        return np.asarray(prior - 0.5 * np.log1p(ratio) + 0.5 * z * ratio / (1.0 + ratio))
-
-
-def weighted(
-    tests: CandidateTests, relative: float = _RELATIVE, odds: float = _ODDS
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights of the terms, and the posterior means and variances of their coefficients.
-
-    Parameters
-    ----------
-    tests : CandidateTests
-    relative : float, optional
-        Prior RMS force of a term, over that of the largest force of its equation.
-    odds : float, optional
-        Prior odds of the terms of one kind and place, together, against a complete model.
-
-    Returns
-    -------
-    (K,) array, (K,) array, (K,) array
-        The complete model has the rest of the weights.
-    """
-    logarithms = tests.log_odds(relative, odds)
-    largest = logarithms.max(initial=0.0)
-    each, complete = np.exp(logarithms - largest), np.exp(-largest)
-    prior = np.square(relative * tests.units)
-    ratio = prior / tests.variances
-    return each / (complete + each.sum()), tests.estimates * ratio / (1.0 + ratio), prior / (1.0 + ratio)
+# Part of the information of a term that is rounding, and part beside another one that separates both.
+_ROUNDING, _SEPARATE, _TINY = 1e-12, 1e-9, 1e-300
 
 
 @dataclass(frozen=True)
@@ -159,13 +103,16 @@ class TermRegression:
             acts=self.acts[:, some],
         )
 
-    def beside(self, k: int) -> TermRegression:
-        """The regression with effect k among all else that is estimated."""
+    def beside(self, *chosen: int) -> TermRegression:
+        """The regression with the chosen effects among all else that is estimated."""
+        if not chosen:
+            return self
+        k, *others = chosen
         own = self.columns[:, :, k]
         along = own / (np.square(own).sum() + _TINY)
         shares = np.einsum("wm,wmk->k", along, self.columns)
         value = self._value(k)
-        return replace(
+        found = replace(
             self,
             effects=self.effects - self.effects[:, k, None] * shares,
             residuals=self.residuals + own * value,
@@ -173,6 +120,7 @@ class TermRegression:
             force=self.force + self.forces[:, :, k] * value,
             forces=self.forces - self.forces[:, :, k, None] * shares,
         )
+        return found.beside(*others)
 
     def divisor(self, changes: FloatArray) -> FloatArray:
         """Divisor, 1 or more, of coefficients and of the changes ``(n, ...)`` of the parameters with them.
@@ -182,18 +130,20 @@ class TermRegression:
         """
         return np.maximum(1.0 - np.tensordot(self.inertia, changes, 1), 1.0)
 
+    def together(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Estimates ``(c,)`` of the chosen coefficients, each beside the others, and their covariance."""
+        columns = self.columns[:, :, list(chosen)]
+        covariance = np.linalg.inv(np.einsum("wmk,wml->kl", columns, columns))
+        values = -covariance @ np.einsum("wmk,wm->k", columns, self.residuals)
+        errors = np.einsum("wmk,wm->wk", columns, self.residuals + columns @ values) @ covariance
+        wider = np.sqrt(np.maximum(np.square(batch_sums(errors)).sum(axis=0) / np.diag(covariance), 1.0))
+        return values, covariance * np.outer(wider, wider)
+
     def joint(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Estimates and standard errors ``(c,)`` of the coefficients of the chosen effects, each beside the others."""
-        found = []
-        for k in chosen:
-            regression = self.of([k, *(x for x in chosen if x != k)])
-            for i in range(1, len(chosen)):
-                regression = regression.beside(i)
-            value, variance = regression.estimates()
-            found.append((value[0], np.sqrt(variance[0])))
-        values, errors = np.reshape(found, (-1, 2)).T
+        """Coefficients ``(c,)`` of the chosen effects, each beside the others, and their standard errors."""
+        values, covariance = self.together(chosen)
         divisor = self.divisor(self.effects[:, list(chosen)] @ values)
-        return values / divisor, errors / divisor
+        return values / divisor, np.sqrt(np.diag(covariance)) / divisor
 
     def explained(self, k: int) -> float:
         """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts."""
@@ -208,46 +158,179 @@ class TermRegression:
         return -float((own * self.residuals).sum() / (np.square(own).sum() + _TINY))
 
 
-def select_terms(
-    terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression
-) -> tuple[list[int], list[float]]:
-    """Terms that explain what a fit leaves, the most probable first, and the share that each explains.
+@dataclass(frozen=True)
+class TermSet:
+    """A term that the model may lack, or two together.
 
     Parameters
     ----------
-    terms : sequence of CandidateTerm
+    members : tuple of int
+        Indices of the terms.
+    log_odds : float
+        Logarithm of the posterior odds against the complete model.
+    means : (s,) array
+        Of the posterior distribution of the coefficients.
+    covariance : (s, s) array
+    """
+
+    members: tuple[int, ...]
+    log_odds: float
+    means: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class CandidateTests:
+    """Tests of K candidates at a fit.
+
+    Parameters
+    ----------
+    terms : tuple of CandidateTerm
     units : (K,) array
         Coefficients with which the RMS force of a term is that of the largest force of its equation.
     regression : TermRegression
+        On the terms.
+    relative : float, optional
+        Prior RMS force of a term, over that of the largest force of its equation.
+    odds : float, optional
+        Prior odds of the terms of one kind and place, together, against a complete model.
+    """
+
+    terms: tuple[CandidateTerm, ...]
+    units: FloatArray
+    regression: TermRegression
+    relative: float = _RELATIVE
+    odds: float = _ODDS
+
+    def beside(self, *chosen: int) -> CandidateTests:
+        """The tests with some of the terms among all else that is estimated."""
+        return replace(self, regression=self.regression.beside(*chosen))
+
+    @property
+    def least(self) -> float:
+        """Logarithm of the odds that no term has by the choice among all."""
+        return _EVIDENCE + float(np.log(max(len(self.terms), 1)))
+
+    def alone(self) -> list[TermSet]:
+        """Each term alone."""
+        (odds, prior), (estimates, variances) = self._prior, self.regression.estimates()
+        information, values = 1.0 / variances[:, None, None], (estimates / variances)[:, None]
+        factors, means, spread = posterior(information, values, prior[:, None])
+        return [TermSet((k,), float(odds[k] + factors[k]), means[k], spread[k]) for k in range(len(self.terms))]
+
+    def sets(self) -> list[TermSet]:
+        """Each term alone, then pairs that are clearly more probable than either of their terms, and than by chance."""
+        alone, (pairs, white) = self.alone(), self._pairs()
+        log_odds = np.array([x.log_odds for x in alone])
+        least = log_odds[pairs].max(axis=1, initial=self.least - _EVIDENCE) + self.least
+        # What neighbouring intervals have in common leaves the largest part of its odds to the pair that explains most.
+        found, part, most = list[TermSet](), 1.0, -np.inf
+        for i in np.argsort(-white, kind="stable"):
+            if part * white[i] <= max(least[i], most - self.least):
+                continue
+            one = self._pair(pairs[i])
+            part = part if np.isfinite(most) else float(np.clip(one.log_odds / white[i], 0.0, 1.0))
+            most = max(most, one.log_odds)
+            if one.log_odds > least[i]:
+                found.append(one)
+        return alone + found
+
+    @property
+    def _prior(self) -> tuple[FloatArray, FloatArray]:
+        """Logarithms ``(K,)`` of the odds of each term, and the variance of its coefficient."""
+        places = [(x.kind, x.place) for x in self.terms]
+        of_kind = Counter(places)
+        log_odds = np.log([self.odds / of_kind[x] for x in places])
+        return log_odds, np.square(self.relative * self.units)
+
+    def _pair(self, pair: IntArray) -> TermSet:
+        odds, prior = self._prior
+        values, covariance = self.regression.together(pair.tolist())
+        information = np.asarray(np.linalg.inv(covariance), float)
+        factor, means, spread = posterior(information, information @ values, prior[pair])
+        return TermSet(tuple(pair.tolist()), float(odds[pair].sum() + factor), means, spread)
+
+    def _pairs(self) -> tuple[IntArray, FloatArray]:
+        """Pairs ``(P, 2)`` of different effects that the log determines, and their log odds if residuals are white."""
+        odds, prior = self._prior
+        columns = self.regression.columns.reshape(-1, len(self.terms))
+        gram: FloatArray = columns.T @ columns
+        values: FloatArray = -columns.T @ self.regression.residuals.ravel()
+        a, b = np.triu_indices(len(self.terms), 1)
+        effects = np.unique([x.parameter for x in self.terms], return_inverse=True)[1]
+        own, separate = np.diag(gram), gram[a, a] - np.square(gram[a, b]) / (gram[b, b] + _TINY)
+        determined = own > _ROUNDING * self.regression.direct
+        pairs = np.stack([a, b], axis=1)[
+            (effects[a] != effects[b]) & determined[a] & determined[b] & (separate > _SEPARATE * own[a])
+        ]
+        factors = posterior(gram[pairs[:, :, None], pairs[:, None, :]], values[pairs], prior[pairs])[0]
+        return pairs, factors + odds[pairs].sum(axis=1)
+
+    def selected(self) -> list[tuple[int, ...]]:
+        """Terms, or pairs of them, that explain what a fit leaves, the most probable first."""
+        effects = np.array([x.parameter for x in self.terms])
+        chosen, allowed, tests = list[tuple[int, ...]](), np.ones(len(self.terms), bool), self
+        sets = tests.sets()
+        while sets := [x for x in sets if x.log_odds >= self.least and allowed[list(x.members)].all()]:
+            members = max(sets, key=lambda x: x.log_odds).members
+            impossible = [k for k in members if not tests._is_possible(k, members)]
+            allowed[impossible] = False
+            if impossible:
+                continue
+            replaceable = [tests._is_replaceable(k, members) for k in members]
+            if all(replaceable):
+                break
+            chosen.append(tuple(members[i] for i in np.argsort(replaceable, kind="stable")))
+            allowed &= ~np.isin(effects, effects[list(members)])
+            tests = tests.beside(*members)
+            sets = tests.sets()
+        return chosen
+
+    def _is_possible(self, k: int, members: tuple[int, ...]) -> bool:
+        """True for a coefficient within its bounds, and a force that is not negligible."""
+        value, (low, high) = self.regression.joint(members)[0][members.index(k)], self.terms[k].bounds
+        share = self.regression.beside(*(x for x in members if x != k)).explained(k)
+        return bool(low < value < high and abs(value) > _SMALLEST * self.units[k] and share > _SHARE)
+
+    def _is_replaceable(self, k: int, members: tuple[int, ...]) -> bool:
+        """True if another term is as probable beside the rest, and the log determines but does not show it beside k."""
+        tests = self.beside(*(x for x in members if x != k))
+        beside, effect = tests.beside(k), self.terms[k].parameter
+        before, after = (np.array([x.log_odds for x in y.alone()]) for y in (tests, beside))
+        other = np.array([x.parameter != effect for x in self.terms]) & np.isfinite(beside.regression.estimates()[1])
+        return bool((other & (after <= 0.0) & (before > before[k] - _EVIDENCE)).any())
+
+
+def posterior(
+    information: FloatArray, values: FloatArray, prior: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Logarithms of Bayes factors of coefficients against their absence; the coefficients' means and covariances.
+
+    Parameters
+    ----------
+    information : (..., s, s) array
+        Inverse covariance of the estimates; zero where the log determines none.
+    values : (..., s) array
+        Information times the estimates.
+    prior : (..., s) array
+        Variances; the means are zero.
 
     Returns
     -------
-    list of int, list of float
-        Share of the mean square unmodelled force that earlier terms left, in the equations where the term acts.
+    (...) array, (..., s) array, (..., s, s) array
     """
-    parameters = np.array([x.parameter for x in terms])
-    least = _EVIDENCE + np.log(max(len(terms), 1))
-    chosen, shares, allowed = list[int](), list[float](), np.ones(len(terms), bool)
-    tests = _tests(terms, units, regression)
-    while allowed.any():
-        odds = tests.log_odds()
-        k = int(np.argmax(np.where(allowed, odds, -np.inf)))
-        if odds[k] < least:
-            break
-        allowed[k] = False
-        value, (low, high), share = float(regression.joint([k])[0][0]), terms[k].bounds, regression.explained(k)
-        if not (low < value < high and abs(value) > _SMALLEST * units[k] and share > _SHARE):
-            continue
-        beside = regression.beside(k)
-        then, others = _tests(terms, units, beside), parameters != parameters[k]
-        # Another term that the log still determines, but does not show any more, explains the same.
-        replaced = np.isfinite(then.variances) & (then.log_odds() <= 0.0)
-        if not (others & replaced & (odds > odds[k] - _EVIDENCE)).any():
-            chosen.append(k)
-            shares.append(share)
-            allowed, tests, regression = allowed & others, then, beside
-    return chosen, shares
+    root = np.sqrt(prior)
+    roots = root[..., :, None] * root[..., None, :]
+    scaled = np.eye(prior.shape[-1]) + information * roots
+    covariance = np.linalg.inv(scaled) * roots
+    means = (covariance @ values[..., None])[..., 0]
+    factors = 0.5 * ((means * values).sum(axis=-1) - np.linalg.slogdet(scaled)[1])
+    return np.asarray(factors), means, covariance
 
 
-def _tests(terms: Sequence[CandidateTerm], units: FloatArray, regression: TermRegression) -> CandidateTests:
-    return CandidateTests(tuple(terms), units, *regression.estimates(), regression.effects)
+def probabilities(sets: Sequence[TermSet]) -> FloatArray:
+    """Probabilities of sets of terms; the complete model has the rest."""
+    logarithms = np.array([x.log_odds for x in sets])
+    largest = logarithms.max(initial=0.0)
+    each = np.exp(logarithms - largest)
+    return np.asarray(each / (np.exp(-largest) + each.sum()))
