@@ -39,8 +39,9 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.regression.rows import excited
+from diransac.identification.structure.equivalents import equivalent_parameters, is_close
 from diransac.identification.structure.refusal import check_signs
-from diransac.identification.structure.structural import check_structure, unidentifiable
+from diransac.identification.structure.structural import check_structure, structural, unidentifiable
 from diransac.process import memory_kept
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
-        *_checks_of_unmeasured(best),
+        *_checks_of_unmeasured(dataset, best),
         *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
     found = _Found(dataset, best, result, ambiguity, candidates, lacks)
@@ -258,15 +259,30 @@ def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
         )
 
 
-def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
-    """A finding where a search is doubtful."""
+def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding]:
+    """Findings where nothing measures a state, so that a search is doubtful, or other parameters are as good."""
+    intervals, model, layout = found.likeliest.intervals, dataset.model, dataset.layout
+    names = unmeasured_by_name(intervals)
     if found.is_doubtful:
-        names, share = unmeasured_by_name(found.likeliest.intervals), 100.0 * found.unexplained
+        share = 100.0 * found.unexplained
         yield Finding(
             "bad",
             f"Nothing measures {names}, and the model leaves {share:.2g} % of an acceleration unexplained, and the log "
             "does not tell them apart",
             f"measure {names}",
+        )
+    signals = measured_signals(intervals)
+    if not names or layout.priors or structural(model, signals, dataset.ranges):
+        return
+    estimate = layout.of_log(found.result.parameters, 0)
+    for other in equivalent_parameters(model, estimate, signals, dataset.ranges)[:1]:
+        pairs = zip(model.parameters, other.tolist(), is_close(other, estimate), strict=True)
+        changed = {n: x for n, x, close in pairs if not close}
+        values = ", ".join(f"{n} = {x:.4g}" for n, x in changed.items())
+        yield Finding(
+            "bad",
+            f"Every log of these signals is the same with {values}, since nothing measures {names}",
+            f"bound {' or '.join(changed)}, or measure {names}",
         )
 
 
