@@ -318,7 +318,7 @@ class Model(Signals):
     @cached_property
     def linearization(self) -> ca.Function:
         """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``."""
-        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        x, u, p = self.rate_jacobians.sx_in()
         outputs = [ca.densify(J) for J in self.rate_jacobians(x, u, p)[:2]]
         return ca.Function("linearization", [x, u, p], outputs, ["x", "u", "p"], ["A", "B"])
 
