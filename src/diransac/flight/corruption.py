@@ -158,7 +158,8 @@ def corrupt(log: Log, noise: Noise, seed: int = 0, *, signals: Sequence[str] | N
 
     fault_mask = _masks_of(log, delays)
     for name in names:
-        faulty = _differ(recorded[name], measured[name])
+        before, after = measured[name], recorded[name]
+        faulty = (after != before) & ~(np.isnan(after) & np.isnan(before))
         fault_mask[name] = fault_mask[name] | faulty if name in fault_mask else faulty
     n_faults = {name: int(fault_mask[name].sum()) for name in names}
     step = {"step": "corrupt", "seed": int(seed), "noise": noise.changed, "signals": names, "faults": n_faults}
@@ -225,8 +226,3 @@ def _masks_of(log: Log, delays: Mapping[str, float]) -> dict[str, BoolArray]:
     masks = Log(log.time, {name: log.fault_mask.get(name, none).astype(float) for name in log.names})
     late = shift(masks, delays)
     return {name: late[name] > 0.0 for name in log.fault_mask}
-
-
-def _differ(a: FloatArray, b: FloatArray) -> BoolArray:
-    """Mask of the rows in which two columns differ; NaN equals NaN."""
-    return np.asarray((a != b) & ~(np.isnan(a) & np.isnan(b)))
