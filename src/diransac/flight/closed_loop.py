@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller
 
-_SAME_INSTANT = 1e-6
-
 
 def fly(
     plant: ModelWithParameters,
@@ -169,7 +167,7 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
     Dimmig et al. 2023, section V: "RMS error between the generated reference trajectory and the extended plant's true
     path".
     """
-    slack = _SAME_INSTANT * trajectory.dt
+    slack = 1e-6 * trajectory.dt  # within which two moments are the same
     common = (log.time >= trajectory.time[0] - slack) & (log.time <= trajectory.time[-1] + slack)
     if not common.any():
         raise SettingsError(

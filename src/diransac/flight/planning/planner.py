@@ -12,9 +12,9 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.solver import TIME_LIMIT, Solution, Strategy, interior_point
-from diransac.flight.planning.task import TIME_STEP, InputLimits, Reference, Task, sampled, task_of
+from diransac.flight.planning.task import TIME_STEP, Reference, Task, sampled, task_of
 from diransac.flight.planning.transcription import Guess, Program
-from diransac.flight.trajectory import Trajectory
+from diransac.flight.trajectory import InputLimits, Trajectory, half_ranges
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -279,7 +279,7 @@ def _binding(task: Task, states: FloatArray, inputs: FloatArray) -> str:
         (states[1:], task.states, task.model.state),
     ):
         # Fraction of a range, or of a unit, within which a value is at its limit.
-        slack = 1e-3 * limits.half_ranges
+        slack = 1e-3 * half_ranges(limits.lower, limits.upper)
         at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
         names += [known[j] for j in np.flatnonzero(at_limit)]
     return " and ".join(names)
