@@ -85,7 +85,6 @@ _IN_NUMPY = {
     **{name: f"arc{name[1:].lower()}" for name in ("ASIN", "ACOS", "ATAN", "ATAN2", "ASINH", "ACOSH", "ATANH")},
 }
 """NumPy's functions where their names differ from those of C."""
-_NOT_IN_NUMPY = {"ERF", "REMAINDER"}
 
 
 def _call(function: str, operation: str) -> str:
@@ -111,7 +110,7 @@ PYTHON = Dialect(
     "NumPy",
     {
         **_ARITHMETIC,
-        **{n: _call(f"np.{_IN_NUMPY.get(n, f)}", n) for n, f in _IN_C.items() if n not in _NOT_IN_NUMPY},
+        **{n: _call(f"np.{_IN_NUMPY.get(n, f)}", n) for n, f in _IN_C.items() if n != "ERF"},
         **{name: f"1.0 * ({{0}} {sign} {{1}})" for name, sign in _COMPARISONS.items()},
         "SIGN": "np.sign({0})",
         "REMAINDER": "({0} - {1} * np.rint({0} / {1}))",
