@@ -159,8 +159,9 @@ class _Run:
             raise StudyError(f"{error}; finished rows are kept") from error
         if attempts + 1 == _ATTEMPTS:
             guard = "" if not isinstance(error, BrokenExecutor) else ' (in a script, under if __name__ == "__main__":)'
+            rows = ", ".join(" ".join(map(str, key)) for key in batch)
             raise StudyError(
-                f"{_named(batch)} were lost {_ATTEMPTS} times, at last by {type(error).__name__}: {error}; "
+                f"rows {rows} were lost {_ATTEMPTS} times, at last by {type(error).__name__}: {error}; "
                 f"finished rows are kept: look at the workers, then run again{guard}"
             ) from error
         self._waiting.append((batch, attempts + 1))
@@ -169,11 +170,6 @@ class _Run:
         """Report the number of rows, these included."""
         self._missing.difference_update(finished)
         self._progress(self._n_asked - len(self._missing), self._n_asked)
-
-
-def _named(batch: Sequence[Key]) -> str:
-    """Subject of a sentence about a batch, in the plural."""
-    return f"rows {', '.join(' '.join(map(str, key)) for key in batch)}"
 
 
 # Processes of this machine --------------------------------------------------------------------------------------------
