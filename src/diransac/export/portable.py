@@ -62,7 +62,7 @@ class PortableModel:
         model = self.model
         if not model.sensors or not model.has_equations:
             return tuple(model.sensor_parameters)
-        x, u, p = ca.SX.sym("x", len(model.state)), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.n_p)
+        x, u, p = model.dynamics.sx_in()
         depends = ca.which_depends(model.dynamics(x, u, p)[0], p, 1, False)
         return tuple(n for n, used in zip(model.parameters, depends, strict=True) if not used)
 

@@ -8,7 +8,7 @@ one-sided offsets and dropouts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -63,13 +63,11 @@ class CorruptedLog(Log):
     @classmethod
     def of(cls, log: Log, fault_mask: Mapping[str, BoolArray]) -> CorruptedLog:
         """Log with masks."""
-        rows = (log.time, log.signals, log.units, log.source, log.history, log.notes, log.unusable, log.filter)
-        return cls(*rows, fault_mask)
+        return cls(**{x.name: getattr(log, x.name) for x in fields(Log)}, fault_mask=fault_mask)
 
     def without_masks(self) -> Log:
         """Log without masks."""
-        rows = (self.time, self.signals, self.units, self.source, self.history, self.notes)
-        return Log(*rows, self.unusable, self.filter)
+        return Log(**{x.name: getattr(self, x.name) for x in fields(Log)})
 
     def _cut(self, rows: slice) -> Log:
         """Rows of the log with their masks."""

@@ -190,8 +190,7 @@ class Model(Signals):
     @cached_property
     def _dependence(self) -> tuple[BoolArray, BoolArray]:
         """Dependence of the signals ``(n_signals, n_x)``, and of the states' rates ``(n_x, n_x)``, on the states."""
-        x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
-        u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
+        x, u, p = self.dynamics.sx_in()
         rates, accelerations = self.dynamics(x, u, p)
         outputs = ca.vertcat(x, accelerations, self.readings(x, accelerations, u, p))
         feeds, flows = (np.array(ca.DM(ca.jacobian_sparsity(y, x), 1), dtype=bool) for y in (outputs, rates))
@@ -233,7 +232,7 @@ class Model(Signals):
     @cached_property
     def affine_sensors(self) -> tuple[str, ...]:
         """Names of the sensors that are affine in the parameters."""
-        return tuple(n for n in self.sensors if self._probe_of_sensors((n,)).is_affine_in_parameters())
+        return tuple(n for n in self.sensors if self._probe_of_sensor(n).is_affine_in_parameters())
 
     @property
     def is_affine(self) -> bool:
@@ -250,7 +249,7 @@ class Model(Signals):
         S, c = ca.SX(len(self.sensors), self.n_p), ca.SX(len(self.sensors), 1)
         for k, name in enumerate(self.sensors):
             if name in self.affine_sensors:
-                S[k, :], c[k] = self._probe_of_sensors((name,)).affine_parts("p", (q, v, a, u, p))
+                S[k, :], c[k] = self._probe_of_sensor(name).affine_parts("p", (q, v, a, u, p))
         return ca.Function("sensor_regressor", [q, v, a, u], [ca.densify(S), ca.densify(c)], list("qvau"), ["S", "c"])
 
     @cached_property
@@ -281,12 +280,12 @@ class Model(Signals):
 
         return {name: Sensor(unit, output(k)) for k, (name, unit) in enumerate(self.sensors.items())}
 
-    def _probe_of_sensors(self, names: Collection[str]) -> Probe:
-        """Probe of some of the measurement equations."""
+    def _probe_of_sensor(self, name: str) -> Probe:
+        """Probe of one of the measurement equations."""
         assert self.measurement is not None
-        symbols = self._symbols()
-        y = self.measurement(*symbols)[[k for k, n in enumerate(self.sensors) if n in names]]
-        return Probe(ca.Function("sensors", list(symbols), [y]), self.parameters.values())
+        symbols = self.measurement.sx_in()
+        y = self.measurement(*symbols)[list(self.sensors).index(name)]
+        return Probe(ca.Function("sensor", symbols, [y]), self.parameters.values())
 
     # ------------------------------------------------------------------ derived functions
 
