@@ -102,8 +102,7 @@ class Model(Signals):
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
         q, v, a, u, p = self._symbols()
         named = self.named(q, v, a, u, p)
-        residual = derivation.call_user(self._label, "equations", equations, *named)
-        results: dict[str, ca.SX | None] = {"residual": residual, "kinematics": None, "measurement": None}
+        results = {"residual": derivation.call_user(self._label, "equations", equations, *named)}
         if kinematics is not None:
             results["kinematics"] = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
         outputs = [derivation.call_sensor(self._label, n, x.equation, *named) for n, x in (sensors or {}).items()]
@@ -111,13 +110,10 @@ class Model(Signals):
             results["measurement"] = ca.vertcat(*outputs)
         self._restore(self._written((q, v, a, u, p), results))
 
-    def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX | None]) -> dict[str, Any]:
+    def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX]) -> dict[str, Any]:
         """Equations as data by name, checked; None for those that the model lacks."""
-        written: dict[str, Any] = {}
+        written: dict[str, Any] = {"kinematics": None, "measurement": None}
         for name, expression in results.items():
-            if expression is None:
-                written[name] = None
-                continue
             arguments, outputs = self._signature(name)
             function = ca.Function(name, list(symbols[: len(arguments)]), [expression], list(arguments), list(outputs))
             expressions.check_size(self._label, function)
