@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -104,12 +104,10 @@ class Controller:
         wanted = _checked_time(time)
         # Tolerance, as a fraction of dt, within which a time counts as that of a row.
         rows = np.maximum(np.searchsorted(self.time, wanted + 1e-6 * self.dt, side="right") - 1, 0)
-        arrays = (self.states[rows], self.inputs[rows], self.gains[rows], self.u_min, self.u_max)
-        return Controller(wanted, *arrays, self.state_names, self.input_names)
+        return replace(self, time=wanted, states=self.states[rows], inputs=self.inputs[rows], gains=self.gains[rows])
 
     def __reduce__(self) -> tuple[object, ...]:
-        arrays = (self.time, self.states, self.inputs, self.gains, self.u_min, self.u_max)
-        return (Controller, (*arrays, self.state_names, self.input_names))
+        return (Controller, tuple(getattr(self, x.name) for x in fields(self)))
 
 
 def _checked_time(time: npt.ArrayLike) -> FloatArray:
