@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.errors import ModelError
+from diransac.model.expressions import OPERANDS
 from diransac.simulation.compiler.graph import Graph, Instruction, read_graph
 
 
@@ -77,7 +78,6 @@ _IN_C = {
     "CONSTPOW": "pow",
 }
 """Functions of C's ``math.h``."""
-_OF_TWO = {"COPYSIGN", "FMIN", "FMAX", "FMOD", "REMAINDER", "HYPOT", "POW", "CONSTPOW", "ATAN2"}
 _IN_NUMPY = {
     "FABS": "abs",
     "POW": "power",
@@ -88,7 +88,7 @@ _IN_NUMPY = {
 
 
 def _call(function: str, operation: str) -> str:
-    return f"{function}({{0}}, {{1}})" if operation in _OF_TWO else f"{function}({{0}})"
+    return f"{function}({{0}}, {{1}})" if OPERANDS[operation.lower()] == 2 else f"{function}({{0}})"
 
 
 C = Dialect(
