@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
 
-_DIGITS = 9
-"""Decimals of a time in s, within which equal moments computed in different ways agree."""
-
 
 def plan(
     plant: ModelWithParameters,
@@ -204,9 +201,10 @@ def _straight(task: Task, durations: FloatArray) -> Guess:
     Velocities are slopes of the coordinates where neither a waypoint nor the reference gives them.
     """
     model, n_q = task.model, task.model.n_q
-    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), _DIGITS)
+    decimals = 9  # of a time in s, within which equal moments computed in different ways agree
+    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), decimals)
     rows = np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / TIME_STEP)))
-    time = np.union1d(np.round(rows, _DIGITS), at_waypoints)
+    time = np.union1d(np.round(rows, decimals), at_waypoints)
     states, followed = np.zeros((len(time), len(model.state))), sampled(task.reference, time)
     fixed = np.full((len(at_waypoints), len(model.state)), np.nan)
     for known, waypoint in zip(fixed, task.waypoints, strict=True):
