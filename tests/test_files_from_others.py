@@ -68,7 +68,7 @@ def test_equations_of_a_file_are_those_that_were_stored_operation_by_operation(n
 
 def test_every_operation_and_all_bits_of_constants_survive():
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
-    values = [expressions.applied(name, *(x, y)[:n]) for name, n in expressions._OPERANDS.items()]
+    values = [expressions.applied(name, *(x, y)[:n]) for name, n in expressions.OPERANDS.items()]
     values += [c * x for c in (0.1, 1 / 3, 5e-324, 1.7976931348623157e308, np.nextafter(1.0, 2.0), 2.0**60 + 1)]
     column = ca.vertcat(*values, ca.SX(1, 1))
     made = ca.Function("f", [ca.vertcat(x), ca.vertcat(y)], [column], ["x", "y"], ["z"])

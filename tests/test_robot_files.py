@@ -114,6 +114,13 @@ def test_parameters_of_another_model_are_refused(described):
         calibrated(described(MJCF), other.parameters, np.ones(4), np.eye(4))
 
 
+def test_a_joint_that_the_description_lacks_is_named(described):
+    model = models.robot(described(MJCF))
+    other = MJCF.replace('="s"', '="other"')
+    with pytest.raises(ModelError, match='there is no joint "s" in the description'):
+        calibrated(described(other, "other"), model.parameters, nominal(model), np.eye(model.n_p))
+
+
 # ---------------------------------------------------------------------- bodies
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,8 @@ def write_model(model: PortableModel, path: str | Path, to: str) -> None:
         function = casadi_function(model)
         write_with(path, lambda temporary: _save(function, temporary))
     else:
-        write_text(path, _TEXTS[to](model))
+        text_of = {"c": c_source, "python": python_source, "yaml": yaml_document}[to]
+        write_text(path, text_of(model))
 
 
 def _save(function: ca.Function, path: Path) -> None:
@@ -323,10 +324,3 @@ def _scalar(value: Any) -> str:
         point = "" if "." in mantissa or not exponent else ".0"  # without it, YAML 1.1 reads 1e-05 as text
         return f"{mantissa}{point}{exponent}{power}"
     return literal(value) if isinstance(value, str) else str(value).lower()
-
-
-_TEXTS: dict[str, Callable[[PortableModel], str]] = {
-    "c": c_source,
-    "python": python_source,
-    "yaml": yaml_document,
-}

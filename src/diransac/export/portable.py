@@ -15,12 +15,6 @@ from diransac.model import Model
 from diransac.plain_text import identifier
 from diransac.text_table import duration
 
-_HOLDS = {
-    "zero-order": "the inputs were held between samples",
-    "linear": "the inputs were interpolated linearly between samples: give a step the mean of those at its ends",
-    "smooth": "the inputs were interpolated smoothly between samples: give a step their mean over it",
-}
-
 
 @dataclass(frozen=True)
 class PortableModel:
@@ -68,7 +62,7 @@ class PortableModel:
         model = self.model
         if not model.sensors or not model.has_equations:
             return tuple(model.sensor_parameters)
-        x, u, p = ca.SX.sym("x", len(model.state)), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.n_p)
+        x, u, p = model.dynamics.sx_in()
         depends = ca.which_depends(model.dynamics(x, u, p)[0], p, 1, False)
         return tuple(n for n, used in zip(model.parameters, depends, strict=True) if not used)
 
@@ -99,7 +93,12 @@ class PortableModel:
     @property
     def remarks(self) -> list[str]:
         """Duties of a caller towards the inputs, a sentence each."""
-        found = [f"In the identification, {_HOLDS[self.hold]}."]
+        between = {
+            "zero-order": "held between samples",
+            "linear": "interpolated linearly between samples: give a step the mean of those at its ends",
+            "smooth": "interpolated smoothly between samples: give a step their mean over it",
+        }
+        found = [f"In the identification, the inputs were {between[self.hold]}."]
         if self.input_delays:
             delays = ", ".join(f"{n} by {duration(x)}" for n, x in self.input_delays.items())
             found.append(f"Recorded inputs act late; the caller delays {delays}.")

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.errors import ModelError
+from diransac.model.expressions import OPERANDS
 from diransac.simulation.compiler.graph import Graph, Instruction, read_graph
 
 
@@ -77,7 +78,6 @@ _IN_C = {
     "CONSTPOW": "pow",
 }
 """Functions of C's ``math.h``."""
-_OF_TWO = {"COPYSIGN", "FMIN", "FMAX", "FMOD", "REMAINDER", "HYPOT", "POW", "CONSTPOW", "ATAN2"}
 _IN_NUMPY = {
     "FABS": "abs",
     "POW": "power",
@@ -85,11 +85,10 @@ _IN_NUMPY = {
     **{name: f"arc{name[1:].lower()}" for name in ("ASIN", "ACOS", "ATAN", "ATAN2", "ASINH", "ACOSH", "ATANH")},
 }
 """NumPy's functions where their names differ from those of C."""
-_NOT_IN_NUMPY = {"ERF", "REMAINDER"}
 
 
 def _call(function: str, operation: str) -> str:
-    return f"{function}({{0}}, {{1}})" if operation in _OF_TWO else f"{function}({{0}})"
+    return f"{function}({{0}}, {{1}})" if OPERANDS[operation.lower()] == 2 else f"{function}({{0}})"
 
 
 C = Dialect(
@@ -111,7 +110,7 @@ PYTHON = Dialect(
     "NumPy",
     {
         **_ARITHMETIC,
-        **{n: _call(f"np.{_IN_NUMPY.get(n, f)}", n) for n, f in _IN_C.items() if n not in _NOT_IN_NUMPY},
+        **{n: _call(f"np.{_IN_NUMPY.get(n, f)}", n) for n, f in _IN_C.items() if n != "ERF"},
         **{name: f"1.0 * ({{0}} {sign} {{1}})" for name, sign in _COMPARISONS.items()},
         "SIGN": "np.sign({0})",
         "REMAINDER": "({0} - {1} * np.rint({0} / {1}))",

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from diransac.flight.trajectory import Trajectory
     from diransac.flight.tvlqr import Controller
 
-_SAME_INSTANT = 1e-6
-
 
 def fly(
     plant: ModelWithParameters,
@@ -108,16 +106,15 @@ def fly_batch(
         Plants of different equations, or controllers of different lengths or for other states.
     """
     flown = [as_plant(plant) for plant in plants]
-    if not flown or len(controllers) != len(flown) or len(seeds or flown) != len(flown):
+    seeds = seeds or [0] * len(flown)
+    if not flown or len(controllers) != len(flown) or len(seeds) != len(flown):
         raise SettingsError(
-            f"{len(flown)} plants, {len(controllers)} controllers and {len(seeds or flown)} seeds do not match; "
+            f"{len(flown)} plants, {len(controllers)} controllers and {len(seeds)} seeds do not match; "
             "give one of each per flight"
         )
     _check_names(flown, controllers)
     starts = [one.states[0] for one in controllers] if initial_states is None else np.asarray(initial_states)
-    states = [
-        plant.initial_state(x, seed) for plant, x, seed in zip(flown, starts, seeds or [0] * len(flown), strict=True)
-    ]
+    states = [plant.initial_state(x, seed) for plant, x, seed in zip(flown, starts, seeds, strict=True)]
     steps = np.array([substeps or plant.substeps(one.dt) for plant, one in zip(flown, controllers, strict=True)])
     logs: dict[int, Log] = {}
     for n in np.unique(steps):
@@ -169,7 +166,7 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
     Dimmig et al. 2023, section V: "RMS error between the generated reference trajectory and the extended plant's true
     path".
     """
-    slack = _SAME_INSTANT * trajectory.dt
+    slack = 1e-6 * trajectory.dt  # within which two moments are the same
     common = (log.time >= trajectory.time[0] - slack) & (log.time <= trajectory.time[-1] + slack)
     if not common.any():
         raise SettingsError(

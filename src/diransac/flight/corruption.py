@@ -8,7 +8,7 @@ one-sided offsets and dropouts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -63,13 +63,11 @@ class CorruptedLog(Log):
     @classmethod
     def of(cls, log: Log, fault_mask: Mapping[str, BoolArray]) -> CorruptedLog:
         """Log with masks."""
-        rows = (log.time, log.signals, log.units, log.source, log.history, log.notes, log.unusable, log.filter)
-        return cls(*rows, fault_mask)
+        return cls(**{x.name: getattr(log, x.name) for x in fields(Log)}, fault_mask=fault_mask)
 
     def without_masks(self) -> Log:
         """Log without masks."""
-        rows = (self.time, self.signals, self.units, self.source, self.history, self.notes)
-        return Log(*rows, self.unusable, self.filter)
+        return Log(**{x.name: getattr(self, x.name) for x in fields(Log)})
 
     def _cut(self, rows: slice) -> Log:
         """Rows of the log with their masks."""
@@ -158,7 +156,8 @@ def corrupt(log: Log, noise: Noise, seed: int = 0, *, signals: Sequence[str] | N
 
     fault_mask = _masks_of(log, delays)
     for name in names:
-        faulty = _differ(recorded[name], measured[name])
+        before, after = measured[name], recorded[name]
+        faulty = (after != before) & ~(np.isnan(after) & np.isnan(before))
         fault_mask[name] = fault_mask[name] | faulty if name in fault_mask else faulty
     n_faults = {name: int(fault_mask[name].sum()) for name in names}
     step = {"step": "corrupt", "seed": int(seed), "noise": noise.changed, "signals": names, "faults": n_faults}
@@ -225,8 +224,3 @@ def _masks_of(log: Log, delays: Mapping[str, float]) -> dict[str, BoolArray]:
     masks = Log(log.time, {name: log.fault_mask.get(name, none).astype(float) for name in log.names})
     late = shift(masks, delays)
     return {name: late[name] > 0.0 for name in log.fault_mask}
-
-
-def _differ(a: FloatArray, b: FloatArray) -> BoolArray:
-    """Mask of the rows in which two columns differ; NaN equals NaN."""
-    return np.asarray((a != b) & ~(np.isnan(a) & np.isnan(b)))

@@ -24,12 +24,6 @@ from diransac.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from diransac.data.log import Log
 
-_CHOICES = {
-    "outliers": ("signals", "rows"),
-    "integrated": ("white", "random-walk"),
-    "first_row": ("clean", "corrupted"),
-}
-
 
 @dataclass(frozen=True)
 class Noise:
@@ -159,7 +153,11 @@ class Noise:
         if not isinstance(self.quantisation, Mapping):
             sizes.append("quantisation")
         self._check(sizes, 0.0, math.inf, "a finite number from 0")
-        for name, choices in _CHOICES.items():
+        for name, choices in (
+            ("outliers", ("signals", "rows")),
+            ("integrated", ("white", "random-walk")),
+            ("first_row", ("clean", "corrupted")),
+        ):
             if getattr(self, name) not in choices:
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose {' or '.join(map(repr, choices))}")
         if not isinstance(self.correlated, bool):
@@ -244,17 +242,28 @@ def gaussian_errors(log: Log, names: Iterable[str], noise: Noise, draws: Draws) 
     """
     if not (noise.acceleration_std or noise.rate_std or noise.angular_acceleration_std):
         return {}
-    return {name: _error(name, _kind(log, name), log, noise, draws) for name in names}
+    return {name: _error(name, log, noise, draws) for name in names}
 
 
-def _error(name: str, kind: str, log: Log, noise: Noise, draws: Draws) -> FloatArray:
+def _error(name: str, log: Log, noise: Noise, draws: Draws) -> FloatArray:
     """Gaussian errors (N,) of one signal, in its unit."""
-    std, order = _sources(noise, log.dt)[kind]
-    in_its_unit = std * (conversion(kind, log.units[name]) or 0.0)
+    sources, unit = _sources(noise, log.dt), log.units.get(name)
+    kind = next((kind for kind in sources if unit and conversion(unit, kind)), None)
+    if unit is None or kind is None:
+        found = f'has the unit "{unit}"' if unit else "has no unit"
+        raise LogError(
+            f'{log.source}: signal "{name}" {found}, but Gaussian noise needs m, m/s, m/s^2, rad, rad/s or rad/s^2; '
+            "give units with dataclasses.replace(log, units=model.units), or choose other signals with signals="
+        )
+    std, order = sources[kind]
+    in_its_unit = std * (conversion(kind, unit) or 0.0)
     if noise.integrated == "white" or kind == "rad/s^2":
-        return np.asarray(in_its_unit * _held(order, log.dt) * draws.normal("gaussian", name))
+        # Integral of order n of an error of 1 held for one sample.
+        held = log.dt**order / math.factorial(order)
+        return np.asarray(in_its_unit * held * draws.normal("gaussian", name))
     # All orders of one coordinate integrate the same errors: those of its acceleration, or of its angular velocity.
-    return in_its_unit * _integrated(draws.normal("gaussian", _stem(name)), order, log.dt)
+    coordinate = name.removesuffix("_ddot").removesuffix("_dot")
+    return in_its_unit * _integrated(draws.normal("gaussian", coordinate), order, log.dt)
 
 
 def _sources(noise: Noise, dt: float) -> dict[str, tuple[float, int]]:
@@ -270,24 +279,6 @@ def _sources(noise: Noise, dt: float) -> dict[str, tuple[float, int]]:
     }
 
 
-def _kind(log: Log, name: str) -> str:
-    """SI unit of a signal, a key of `_sources`."""
-    unit = log.units.get(name)
-    kinds = [kind for kind in ("m/s^2", "m/s", "m", "rad/s^2", "rad/s", "rad") if unit and conversion(unit, kind)]
-    if not kinds:
-        found = f'has the unit "{unit}"' if unit else "has no unit"
-        raise LogError(
-            f'{log.source}: signal "{name}" {found}, but Gaussian noise needs m, m/s, m/s^2, rad, rad/s or rad/s^2; '
-            "give units with dataclasses.replace(log, units=model.units), or choose other signals with signals="
-        )
-    return kinds[0]
-
-
-def _held(order: int, dt: float) -> float:
-    """Integral of order n of an error of 1 held for one sample: dt^n / n!."""
-    return (1.0, dt, dt**2 / 2.0)[order]
-
-
 def _integrated(errors: FloatArray, order: int, dt: float) -> FloatArray:
     """Errors, each held for one sample, integrated from zero at the first row."""
     if order == 0:
@@ -299,11 +290,6 @@ def _integrated(errors: FloatArray, order: int, dt: float) -> FloatArray:
 def _sum_before(values: FloatArray) -> FloatArray:
     """Sum of the samples before each sample (N,)."""
     return np.concatenate([[0.0], np.cumsum(values[:-1])])
-
-
-def _stem(name: str) -> str:
-    """Name of the coordinate that a signal is a derivative of."""
-    return name.removesuffix("_ddot").removesuffix("_dot")
 
 
 # Quantisation and faults ---------------------------------------------------------------------------------------------

@@ -5,12 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
+
+InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
+"""Smallest and largest value by name."""
+
+
+def half_ranges(lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Half the range between limits (n,); 1 where it is zero or infinite."""
+    half = 0.5 * (upper - lower)
+    return np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
+
+
+def is_even(time: FloatArray) -> bool:
+    """True for times (K,) that increase evenly, 2 at least."""
+    steps = np.diff(time)
+    return bool(len(steps) and (steps > 0.0).all() and np.ptp(steps) <= 1e-6 * steps.mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +62,7 @@ class Trajectory:
     inputs: FloatArray
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] = ()
-    input_limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    input_limits: InputLimits = field(default_factory=dict)
     cost: float | None = None
 
     def __post_init__(self) -> None:
@@ -62,8 +77,7 @@ class Trajectory:
                 raise SettingsError(f"the trajectory's {name} hold a NaN or an infinity")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        steps = np.diff(self.time)
-        if not (steps > 0).all() or np.ptp(steps) > 1e-6 * steps.mean():
+        if not is_even(self.time):
             raise SettingsError("the trajectory's time must increase evenly; resample it")
         for name, names, array in (("state", self.state_names, self.states), ("input", self.input_names, self.inputs)):
             if names and len(names) != array.shape[1]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -13,16 +13,13 @@ from diransac.arrays import FloatArray
 from diransac.data.preprocessing import continuous_quaternions
 from diransac.errors import SettingsError
 from diransac.flight.riccati import Problem, gains_of
-from diransac.flight.trajectory import Trajectory
+from diransac.flight.trajectory import InputLimits, Trajectory, half_ranges, is_even
 from diransac.model import Model
 from diransac.model.plant import ModelWithParameters, as_plant
 from diransac.simulation import LinearFeedback
 
 Weights: TypeAlias = "npt.ArrayLike | Mapping[str, float]"
 """Matrix, diagonal, one number for the whole diagonal, or diagonal by name."""
-
-InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
-"""Name of an input -> smallest and largest value."""
 
 
 # The controller ------------------------------------------------------------------------------------------------------
@@ -78,7 +75,6 @@ class Controller:
             if names and len(names) != n:
                 raise SettingsError(f"the controller has {n} {name}s and {len(names)} {name}_names")
             object.__setattr__(self, f"{name}_names", names)
-        time.flags.writeable = False
         arrays = {"states": law.x_ref, "inputs": law.u_ref, "gains": law.gains, "u_min": law.u_min, "u_max": law.u_max}
         for name, array in {"time": time, **arrays}.items():
             object.__setattr__(self, name, array)
@@ -108,12 +104,10 @@ class Controller:
         wanted = _checked_time(time)
         # Tolerance, as a fraction of dt, within which a time counts as that of a row.
         rows = np.maximum(np.searchsorted(self.time, wanted + 1e-6 * self.dt, side="right") - 1, 0)
-        arrays = (self.states[rows], self.inputs[rows], self.gains[rows], self.u_min, self.u_max)
-        return Controller(wanted, *arrays, self.state_names, self.input_names)
+        return replace(self, time=wanted, states=self.states[rows], inputs=self.inputs[rows], gains=self.gains[rows])
 
     def __reduce__(self) -> tuple[object, ...]:
-        arrays = (self.time, self.states, self.inputs, self.gains, self.u_min, self.u_max)
-        return (Controller, (*arrays, self.state_names, self.input_names))
+        return (Controller, tuple(getattr(self, x.name) for x in fields(self)))
 
 
 def _checked_time(time: npt.ArrayLike) -> FloatArray:
@@ -122,8 +116,7 @@ def _checked_time(time: npt.ArrayLike) -> FloatArray:
     Raises SettingsError: it is not evenly spaced.
     """
     array = np.array(time, np.float64)
-    steps = np.diff(array) if array.ndim == 1 else np.zeros(0)
-    if not len(steps) or not (steps > 0).all() or np.ptp(steps) > 1e-6 * steps.mean():
+    if array.ndim != 1 or not is_even(array):
         raise SettingsError(
             f"a controller's time must increase evenly, in at least 2 rows; found an array of shape {array.shape}"
         )
@@ -247,7 +240,7 @@ def tvlqr_batch(
             np.array(list(plant.parameters.values())),
             trajectory,
             of_states,
-            _full_use(*ends) if of_inputs is None else of_inputs,
+            np.diag(half_ranges(*ends) ** -2.0) if of_inputs is None else of_inputs,  # full use costs 1
             at_end,
         )
         for plant, trajectory, ends in zip(known, trajectories, edges, strict=True)
@@ -327,12 +320,6 @@ def _cost_matrices(
             f"R must be positive definite: each input needs a positive weight; found {of_inputs.tolist()}"
         )
     return of_states, of_inputs, of_states if Qf is None else _matrix("Qf", Qf, model.state)
-
-
-def _full_use(low: FloatArray, high: FloatArray) -> FloatArray:
-    """R by which full use of each input within these limits costs 1."""
-    half = (high - low) / 2
-    return np.diag(np.where(np.isfinite(half) & (half > 0), half, 1.0) ** -2.0)
 
 
 def _matrix(name: str, weights: Weights, names: Sequence[str]) -> FloatArray:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 _N_POINTS = 40
 _TOLERANCE = 1e-8
-_ARGUMENTS = "qvaup"
 
 
 class Symbols:
@@ -198,7 +197,7 @@ def _nan_outputs(function: ca.Function) -> Iterator[int]:
     """Indices of the outputs whose expression holds a NaN constant."""
     if not expressions.has_nan(function):
         return
-    arguments = [ca.SX.sym(n, *function.size_in(i)) for i, n in enumerate(function.name_in())]
+    arguments = function.sx_in()
     for i, expression in enumerate(ca.vertsplit(function(*arguments))):
         if expressions.has_nan(ca.Function("one", arguments, [expression])):
             yield i
@@ -230,7 +229,7 @@ class Probe:
 
         They are taken at ``z = 0`` where the graph is affine in ``z``, elsewhere at a point within the bounds.
         """
-        k = _ARGUMENTS.index(argument)
+        k = "qvaup".index(argument)
         z, r = symbols[k], self.residual(*symbols)
         J = ca.jacobian(r, z)
         if not ca.depends_on(J, z):
@@ -241,8 +240,7 @@ class Probe:
 
     def is_affine(self, argument: str, values: FloatArray) -> bool:
         """True if ``r = J z + c`` wherever ``r`` is finite, with ``values (n, n_points)`` of the argument ``z``."""
-        symbols = [ca.SX.sym(n, self.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
-        k = _ARGUMENTS.index(argument)
+        symbols, k = self.residual.sx_in(), "qvaup".index(argument)
         J, c = self.affine_parts(argument, symbols)
         z = symbols[k]
         size = ca.fabs(J) @ ca.fabs(z) + ca.fabs(c) + 1.0
@@ -292,7 +290,7 @@ def affine_in_acceleration(
             f"{label}: the equations are not affine in the accelerations {', '.join(accelerations)}; "
             "write them as M a + c = 0, with a to the first power only"
         )
-    q, v, a, u, p = (ca.SX.sym(n, probe.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS))
+    q, v, a, u, p = probe.residual.sx_in()
     M, c = probe.affine_parts("a", (q, v, a, u, p))
     return ca.Function("M", [q, v, u, p], [M]), ca.Function("c", [q, v, u, p], [c])
 
@@ -347,7 +345,7 @@ def nonlinear_parameters(probe: Probe, names: Sequence[str]) -> tuple[str, ...]:
     """Names of the parameters in which the residual is not affine, by evaluation within the bounds and everywhere."""
     if probe.is_affine_in_parameters():
         return ()
-    symbols = [ca.SX.sym(n, probe.residual.size1_in(i)) for i, n in enumerate(_ARGUMENTS)]
+    symbols = probe.residual.sx_in()
     r = probe.residual(*symbols)
     both = ca.Function("both", symbols, [r, ca.densify(ca.jacobian(r, symbols[4]))])
     start = np.hstack([probe.points[4][:, ::2], probe.everywhere[:, ::2]])

@@ -29,7 +29,7 @@ _VERSION = 1
 
 
 # fmt: off
-_OPERANDS = {**dict.fromkeys((
+OPERANDS = {**dict.fromkeys((
     "neg", "sqrt", "sq", "twice", "inv", "fabs", "floor", "ceil", "sign", "not", "exp", "expm1", "log", "log1p", "sinh",
     "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfinv", "sin", "cos", "tan", "asin", "acos", "atan",
 ), 1), **dict.fromkeys((
@@ -164,7 +164,7 @@ def _number(label: str, value: float) -> str:
 
 def _word(label: str, operation: str) -> str:
     """The operation itself.  Raises ModelError: it is not in the list."""
-    if operation in _OPERANDS:
+    if operation in OPERANDS:
         return operation
     if operation == "call":
         raise ModelError(
@@ -237,7 +237,7 @@ def _value(line: str, values: Sequence[ca.SX], elements: Mapping[str, Sequence[c
     if word in elements:
         (text,) = operands
         return elements[word][_index(text)]
-    if len(operands) != _OPERANDS[word]:
+    if len(operands) != OPERANDS[word]:
         raise ValueError(line)
     return applied(word, *(values[_index(text)] for text in operands))
 

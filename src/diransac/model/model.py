@@ -102,8 +102,7 @@ class Model(Signals):
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
         q, v, a, u, p = self._symbols()
         named = self.named(q, v, a, u, p)
-        residual = derivation.call_user(self._label, "equations", equations, *named)
-        results: dict[str, ca.SX | None] = {"residual": residual, "kinematics": None, "measurement": None}
+        results = {"residual": derivation.call_user(self._label, "equations", equations, *named)}
         if kinematics is not None:
             results["kinematics"] = derivation.call_user(self._label, "kinematics", kinematics, *self.named(q, v))
         outputs = [derivation.call_sensor(self._label, n, x.equation, *named) for n, x in (sensors or {}).items()]
@@ -111,13 +110,10 @@ class Model(Signals):
             results["measurement"] = ca.vertcat(*outputs)
         self._restore(self._written((q, v, a, u, p), results))
 
-    def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX | None]) -> dict[str, Any]:
+    def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX]) -> dict[str, Any]:
         """Equations as data by name, checked; None for those that the model lacks."""
-        written: dict[str, Any] = {}
+        written: dict[str, Any] = {"kinematics": None, "measurement": None}
         for name, expression in results.items():
-            if expression is None:
-                written[name] = None
-                continue
             arguments, outputs = self._signature(name)
             function = ca.Function(name, list(symbols[: len(arguments)]), [expression], list(arguments), list(outputs))
             expressions.check_size(self._label, function)
@@ -190,8 +186,7 @@ class Model(Signals):
     @cached_property
     def _dependence(self) -> tuple[BoolArray, BoolArray]:
         """Dependence of the signals ``(n_signals, n_x)``, and of the states' rates ``(n_x, n_x)``, on the states."""
-        x = ca.vertcat(*(ca.SX.sym(n) for n in self.state))
-        u, p = ca.SX.sym("u", self.n_u), ca.SX.sym("p", self.n_p)
+        x, u, p = self.dynamics.sx_in()
         rates, accelerations = self.dynamics(x, u, p)
         outputs = ca.vertcat(x, accelerations, self.readings(x, accelerations, u, p))
         feeds, flows = (np.array(ca.DM(ca.jacobian_sparsity(y, x), 1), dtype=bool) for y in (outputs, rates))
@@ -233,7 +228,7 @@ class Model(Signals):
     @cached_property
     def affine_sensors(self) -> tuple[str, ...]:
         """Names of the sensors that are affine in the parameters."""
-        return tuple(n for n in self.sensors if self._probe_of_sensors((n,)).is_affine_in_parameters())
+        return tuple(n for n in self.sensors if self._probe_of_sensor(n).is_affine_in_parameters())
 
     @property
     def is_affine(self) -> bool:
@@ -250,7 +245,7 @@ class Model(Signals):
         S, c = ca.SX(len(self.sensors), self.n_p), ca.SX(len(self.sensors), 1)
         for k, name in enumerate(self.sensors):
             if name in self.affine_sensors:
-                S[k, :], c[k] = self._probe_of_sensors((name,)).affine_parts("p", (q, v, a, u, p))
+                S[k, :], c[k] = self._probe_of_sensor(name).affine_parts("p", (q, v, a, u, p))
         return ca.Function("sensor_regressor", [q, v, a, u], [ca.densify(S), ca.densify(c)], list("qvau"), ["S", "c"])
 
     @cached_property
@@ -281,12 +276,12 @@ class Model(Signals):
 
         return {name: Sensor(unit, output(k)) for k, (name, unit) in enumerate(self.sensors.items())}
 
-    def _probe_of_sensors(self, names: Collection[str]) -> Probe:
-        """Probe of some of the measurement equations."""
+    def _probe_of_sensor(self, name: str) -> Probe:
+        """Probe of one of the measurement equations."""
         assert self.measurement is not None
-        symbols = self._symbols()
-        y = self.measurement(*symbols)[[k for k, n in enumerate(self.sensors) if n in names]]
-        return Probe(ca.Function("sensors", list(symbols), [y]), self.parameters.values())
+        symbols = self.measurement.sx_in()
+        y = self.measurement(*symbols)[list(self.sensors).index(name)]
+        return Probe(ca.Function("sensor", symbols, [y]), self.parameters.values())
 
     # ------------------------------------------------------------------ derived functions
 
@@ -318,7 +313,7 @@ class Model(Signals):
     @cached_property
     def linearization(self) -> ca.Function:
         """Function ``(x, u, p) -> (A (n_x, n_x), B (n_x, n_u))`` of ``d x_dot = A dx + B du``."""
-        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        x, u, p = self.rate_jacobians.sx_in()
         outputs = [ca.densify(J) for J in self.rate_jacobians(x, u, p)[:2]]
         return ca.Function("linearization", [x, u, p], outputs, ["x", "u", "p"], ["A", "B"])
 

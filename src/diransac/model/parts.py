@@ -70,7 +70,7 @@ class _Dependence(NamedTuple):
 
 
 def _dependence(model: Model, function: ca.Function) -> _Dependence:
-    symbols = [ca.SX.sym(n, function.size1_in(k)) for k, n in enumerate("qvaup")]
+    symbols = function.sx_in()
     values = function(*symbols)
     q, v, a, u, p = (np.array(ca.DM(ca.jacobian_sparsity(values, x), 1), dtype=bool) for x in symbols)
     states = v | a
@@ -93,9 +93,7 @@ def _part(model: Model, name: str, group: Sequence[int]) -> Model:
     kept = {*states, *_selected(model.inputs, inputs), *_selected(model.parameters, parameters)}
 
     def arguments(*vectors: Symbols) -> list[ca.SX]:
-        rates = list(model.rate_names)
-        every = (list(model.coordinates), rates, rates, list(model.inputs), list(model.parameters))
-        pairs = zip(vectors, every, strict=True)
+        pairs = zip(vectors, model.argument_names, strict=True)
         return [ca.SX(ca.vertcat(*(x[n] if n in kept else ca.SX(0) for n in names))) for x, names in pairs]
 
     def equations(*vectors: Symbols) -> Sequence[Any]:

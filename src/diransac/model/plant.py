@@ -7,7 +7,7 @@ Planning, control and identification use the model alone; only simulations inclu
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -174,20 +174,15 @@ class Disturbance:
         results = {"forces": n_v, "accelerations": n_v, "rates": len(self.states)}
         return expressions.restored("effect", self._effect_data, self._sizes, results)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        kept = {name: value for name, value in vars(self).items() if name != "effect"}
-        return (_restored, (kept,))
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "effect"}
+
+    def __setstate__(self, kept: Mapping[str, Any]) -> None:
+        vars(self).update(kept)
+        self.effect = self._restored_effect()
 
     def __repr__(self) -> str:
         return f"Disturbance({self.name!r} of {self.model.name!r}, constants={self.constants})"
-
-
-def _restored(kept: Mapping[str, Any]) -> Disturbance:
-    """Unpickled disturbance."""
-    disturbance = Disturbance.__new__(Disturbance)
-    vars(disturbance).update(kept)
-    disturbance.effect = disturbance._restored_effect()
-    return disturbance
 
 
 class DisturbedModel:
@@ -243,10 +238,10 @@ class DisturbedModel:
         q, v = x[: model.n_q, 0], x[model.n_q : n_x, 0]
         known, acceleration = model.dynamics(x[:n_x], u, p[: model.n_p])
         forces, rates = ca.SX(model.n_v, 1), []
-        for effect in self._effects(q, v, x[n_x:, 0], u, p):
-            forces += effect[0]
-            acceleration += effect[1]
-            rates.append(effect[2])
+        for force, further, rate in self._effects(q, v, x[n_x:, 0], u, p):
+            forces += force
+            acceleration += further
+            rates.append(rate)
         if forces.nnz():
             acceleration += model.force_response(q, v, u, p[: model.n_p], forces)
         clock = ca.SX.ones(int("t" in self.own_states))
@@ -254,18 +249,14 @@ class DisturbedModel:
         outputs = ca.cse([ca.densify(x_dot), ca.densify(acceleration)])
         return ca.Function("dynamics", [x, u, p], outputs, ["x", "u", "p"], ["x_dot", "a"])
 
-    def _effects(self, q: ca.SX, v: ca.SX, own: ca.SX, u: ca.SX, p: ca.SX) -> list[tuple[ca.SX, ca.SX, ca.SX]]:
+    def _effects(self, q: ca.SX, v: ca.SX, own: ca.SX, u: ca.SX, p: ca.SX) -> Iterator[tuple[ca.SX, ca.SX, ca.SX]]:
         """Forces, accelerations and rates of every disturbance."""
         constants, states = iter(ca.vertsplit(p)[self.model.n_p :]), iter(ca.vertsplit(own))
-        own_of = [
-            ([next(constants) for _ in one.constants], [next(states) for _ in one.states]) for one in self.disturbances
-        ]
-        time = next(states, ca.SX(0))
-        effects = list[tuple[ca.SX, ca.SX, ca.SX]]()
-        for one, (values, state) in zip(self.disturbances, own_of, strict=True):
-            forces, accelerations, rates = one.effect(q, v, u, p[: self.model.n_p], ca.vertcat(*values, *state, time))
-            effects.append((forces, accelerations, rates))
-        return effects
+        time = own[-1, 0] if "t" in self.own_states else ca.SX(0)
+        for one in self.disturbances:
+            values = [*(next(constants) for _ in one.constants), *(next(states) for _ in one.states)]
+            forces, accelerations, rates = one.effect(q, v, u, p[: self.model.n_p], ca.vertcat(*values, time))
+            yield forces, accelerations, rates
 
     @cached_property
     def readings(self) -> ca.Function:
@@ -278,7 +269,7 @@ class DisturbedModel:
     @cached_property
     def rate_jacobians(self) -> ca.Function:
         """Function ``(x, u, p) -> d x_dot / d(x, u, p)``, three sparse matrices."""
-        x, u, p = (ca.SX.sym(n, size) for n, size in (("x", len(self.state)), ("u", self.n_u), ("p", self.n_p)))
+        x, u, p = self.dynamics.sx_in()
         x_dot = self.dynamics(x, u, p)[0]
         jacobians = ca.cse([ca.jacobian(x_dot, z) for z in (x, u, p)])
         return ca.Function("rate_jacobians", [x, u, p], jacobians, ["x", "u", "p"], ["dx", "du", "dp"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
@@ -97,6 +97,12 @@ class Signals:
         """Number of elements of the arguments q, v, a, u and p."""
         return {"q": self.n_q, "v": self.n_v, "a": self.n_v, "u": self.n_u, "p": self.n_p}
 
+    @property
+    def argument_names(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the elements of the arguments q, v, a, u and p in the equations."""
+        rates = self.rate_names
+        return tuple(self.coordinates), rates, rates, tuple(self.inputs), tuple(self.parameters)
+
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         q, v, a, u, p = (ca.vertcat(*(ca.SX.sym(n) for n in names)) for names in self._groups)
         return q, v, a, u, p
@@ -109,8 +115,9 @@ class Signals:
     @property
     def rate_names(self) -> tuple[str, ...]:
         """Names of velocities and accelerations in the equations: ``theta``, not ``theta_dot``."""
-        of_motion = self.coordinates if self._velocities_are_derivatives else self.velocities_of_motion
-        return (*of_motion, *self.first_order)
+        of_motion = self.velocities_of_motion
+        are_derivatives = list(of_motion) == [f"{q}_dot" for q in self.coordinates]
+        return (*(self.coordinates if are_derivatives else of_motion), *self.first_order)
 
     @property
     def velocities_of_motion(self) -> dict[str, str]:
@@ -132,16 +139,9 @@ class Signals:
     def named(self, *vectors: ca.SX) -> tuple[Symbols, ...]:
         """The arguments of the equations: the vectors q, v, a, u and p, or the first few, with named components."""
         kinds = ("coordinates", "velocities", "accelerations", "inputs", "parameters")
-        groups: Sequence[Iterable[str]] = (
-            self.coordinates,
-            self.rate_names,
-            self.rate_names,
-            self.inputs,
-            self.parameters,
-        )
         return tuple(
             Symbols(self._label, kind, dict(zip(names, ca.vertsplit(x), strict=True)))
-            for kind, names, x in zip(kinds, groups, vectors, strict=False)
+            for kind, names, x in zip(kinds, self.argument_names, vectors, strict=False)
         )
 
     def parameter_vector(self, parameters: Mapping[str, float]) -> FloatArray:
@@ -158,10 +158,6 @@ class Signals:
             bad = [n for n, x in zip(self.parameters, values, strict=True) if not np.isfinite(x)]
             raise ModelError(f"{self._label}: parameter {bad[0]} is {parameters[bad[0]]}; give a finite number")
         return values
-
-    @property
-    def _velocities_are_derivatives(self) -> bool:
-        return list(self.velocities_of_motion) == [f"{q}_dot" for q in self.coordinates]
 
 
 def _per_second(unit: str, order: int = 1) -> str:

@@ -5,9 +5,9 @@ In comes a study file, or a fleet of logs; out comes a store, one SQLite file, a
 | file | contents |
 |---|---|
 | `engine.py`, `store.py` | rows by batches on processes, an executor or a cluster; the SQLite file that keeps them |
-| `specification.py`, `axis.py`, `plants.py`, `method_choice.py`, `tables.py` | a study as pydantic models |
+| `specification.py`, `axis.py`, `method_choice.py`, `tables.py` | a study as pydantic models |
+| `plants.py` | its plant: machines with effects that their models leave out, and the choice of one |
 | `library.py`, `builtin/`, `template.toml` | sources of studies; those of the paper's figures |
-| `machines.py` | plants with effects that their models leave out |
 | `trials.py`, `data.py` | `run_study`; a trial; its data |
 | `assessment.py` | pseudo-true parameters and errors relative to them |
 | `fleet.py` | `identify_each`: one result per log |

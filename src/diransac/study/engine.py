@@ -41,8 +41,6 @@ Progress = Callable[[int, int], None]
 Computation = Callable[[Sequence[Key]], Sequence[dict[str, Any]]]
 """Rows of some keys, which differ in one trial or log; called in a worker, to which it is pickled."""
 
-_ATTEMPTS = 3
-
 
 def run_work(
     work: Work,
@@ -157,10 +155,12 @@ class _Run:
             return
         if isinstance(error, StudyError):  # the worker is alive and would fail again
             raise StudyError(f"{error}; finished rows are kept") from error
-        if attempts + 1 == _ATTEMPTS:
+        most = 3
+        if attempts + 1 == most:
             guard = "" if not isinstance(error, BrokenExecutor) else ' (in a script, under if __name__ == "__main__":)'
+            rows = ", ".join(" ".join(map(str, key)) for key in batch)
             raise StudyError(
-                f"{_named(batch)} were lost {_ATTEMPTS} times, at last by {type(error).__name__}: {error}; "
+                f"rows {rows} were lost {most} times, at last by {type(error).__name__}: {error}; "
                 f"finished rows are kept: look at the workers, then run again{guard}"
             ) from error
         self._waiting.append((batch, attempts + 1))
@@ -169,11 +169,6 @@ class _Run:
         """Report the number of rows, these included."""
         self._missing.difference_update(finished)
         self._progress(self._n_asked - len(self._missing), self._n_asked)
-
-
-def _named(batch: Sequence[Key]) -> str:
-    """Subject of a sentence about a batch, in the plural."""
-    return f"rows {', '.join(' '.join(map(str, key)) for key in batch)}"
 
 
 # Processes of this machine --------------------------------------------------------------------------------------------

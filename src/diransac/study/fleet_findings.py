@@ -375,14 +375,17 @@ def _steps_of(
 ) -> tuple[list[Change | Drift], tuple[float, float]]:
     """Changes and drift of a vehicle, and the value at its beginning with the variance."""
     variances = life.variances + within**2
-    slope = _line(life.values, variances)
-    splits = sorted(_splits(life.values, variances, limit))
-    if slope is not None and slope.distance > limit and (not splits or _prefers_line(life, variances, splits, slope)):
-        first, last = slope.ends
-        drift = Drift(life.vehicle, name, first, last, slope.distance, unit)
-        return [drift], (first, slope.variance_of_first)
+    line, splits = _line(life.values, variances), sorted(_splits(life.values, variances, limit))
     bounds = [0, *(k for k, _ in splits), len(life.values)]
     means = [huber_mean(life.values[a:b], variances[a:b]) for a, b in pairwise(bounds)]
+    if line is not None and line.distance > limit:
+        steps = np.repeat([mean for mean, _ in means], np.diff(bounds))
+        # Huber's loss and Schwarz' criterion: a line has two coefficients; so has each further step, place and size.
+        extra = (2 * len(splits) - 1) * float(np.log(len(steps)))
+        of_line, of_steps = (_loss(life.values - fitted, variances) for fitted in (line.fitted, steps))
+        if not splits or of_line < of_steps + extra:
+            first, last = float(line.fitted[0]), float(line.fitted[-1])
+            return [Drift(life.vehicle, name, first, last, line.distance, unit)], (first, line.variance_of_first)
     changes: list[Change | Drift] = [
         Change(life.vehicle, name, means[i][0], means[i + 1][0], life.logs[k], k + 1, distance, unit)
         for i, (k, distance) in enumerate(splits)
@@ -410,16 +413,11 @@ def _splits(values: FloatArray, variances: FloatArray, limit: float, start: int 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A line over the order of the logs: values at the ends, and the slope's distance from 0 in standard errors."""
+    """A line over the order of the logs (n,), and the slope's distance from 0 in standard errors."""
 
     fitted: FloatArray
     distance: float
     variance_of_first: float
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Values at the first and at the last log."""
-        return float(self.fitted[0]), float(self.fitted[-1])
 
 
 def _line(values: FloatArray, variances: FloatArray) -> _Line | None:
@@ -439,17 +437,6 @@ def _line(values: FloatArray, variances: FloatArray) -> _Line | None:
     covariance = np.linalg.inv((design / variances[:, None]).T @ design) / _EFFICIENCY
     distance = float(abs(coefficients[1]) / np.sqrt(covariance[1, 1]))
     return _Line(design @ coefficients, distance, float(covariance[0, 0]))
-
-
-def _prefers_line(life: _Life, variances: FloatArray, splits: Sequence[tuple[int, float]], line: _Line) -> bool:
-    """True if a line has the lower cost than the steps, by Huber's loss and Schwarz' criterion."""
-    bounds = [0, *(k for k, _ in splits), len(life.values)]
-    steps = np.empty(len(life.values))
-    for a, b in pairwise(bounds):
-        steps[a:b] = huber_mean(life.values[a:b], variances[a:b])[0]
-    # A line has two coefficients; so has each further step: its place and its size.
-    extra = (2 * len(splits) - 1) * float(np.log(len(life.values)))
-    return _loss(life.values - line.fitted, variances) < _loss(life.values - steps, variances) + extra
 
 
 def _loss(residuals: FloatArray, variances: FloatArray) -> float:

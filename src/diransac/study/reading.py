@@ -251,8 +251,8 @@ class Status:
         rows += [[level, *(_text(self.cells.get((level, method))) for method in methods)] for level in levels]
         title = f"{self.name} in {self.store}: {self.done} done, {self.failed} failed, {self.missing} missing"
         lines = [f"{title} of {self.asked} rows, one per level, trial and method", *aligned(rows)]
-        failures = {(method, cell.error): level for (level, method), cell in self.cells.items() if cell.error}
-        lines += [f"! {method} failed, as at level {level}: {error}" for (method, error), level in _first(failures)]
+        failures = {method: (level, cell.error) for (level, method), cell in self.cells.items() if cell.error}
+        lines += [f"! {method} failed, as at level {level}: {error}" for method, (level, error) in failures.items()]
         return "\n".join(lines)
 
 
@@ -285,8 +285,3 @@ def _text(cell: TrialCounts | None) -> str:
     counts = [f"{cell.done} done"]
     counts += [f"{n} {word}" for n, word in ((cell.failed, "failed"), (cell.missing, "missing")) if n]
     return ", ".join(counts)
-
-
-def _first(failures: Mapping[tuple[str, Any], str]) -> list[tuple[tuple[str, Any], str]]:
-    """One failure per method."""
-    return list({method: ((method, error), level) for (method, error), level in failures.items()}.values())

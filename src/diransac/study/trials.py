@@ -11,7 +11,7 @@ import json
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -179,7 +179,7 @@ class _Point:
 
 
 @contextmanager
-def _timed(cases: Sequence[_Case], stage: str) -> Iterator[None]:
+def _timed(cases: Collection[_Case], stage: str) -> Iterator[None]:
     """Divide the time of the block equally among cases."""
     begin = time.perf_counter()
     yield
@@ -187,7 +187,7 @@ def _timed(cases: Sequence[_Case], stage: str) -> Iterator[None]:
         case.seconds[stage] += (time.perf_counter() - begin) / len(cases)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Case:
     """One method in one trial."""
 
@@ -293,18 +293,16 @@ def _identify(cases: Sequence[_Case]) -> None:
 def _evaluate(point: _Point, cases: Sequence[_Case], shape: str) -> None:
     """Plan a trajectory with the parameters of each case, and fly it on the plant under feedback."""
     plans = _plans(cases, shape)
-    planned = [case for case in cases if id(case) in plans]
-    controllers = _controllers(planned, plans, point.study.control)
-    steered = [case for case in planned if id(case) in controllers]
-    with _timed(steered, "fly"):
-        seeds = [derived_seed(case.seed, shape) for case in steered]
-        logs = flown(point.plant, [controllers[id(case)] for case in steered], seeds)
-    for case, log in zip(steered, logs, strict=True):
+    controllers = _controllers(plans, point.study.control)
+    with _timed(controllers, "fly"):
+        seeds = [derived_seed(case.seed, shape) for case in controllers]
+        logs = flown(point.plant, list(controllers.values()), seeds)
+    for case, log in zip(controllers, logs, strict=True):
         with case.attempt("fly"):
-            case.assess(shape, plans[id(case)], log)
+            case.assess(shape, plans[case], log)
 
 
-def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
+def _plans(cases: Sequence[_Case], shape: str) -> dict[_Case, Trajectory]:
     """Trajectory of each case that has a plan."""
     plans = {}
     for case in cases:
@@ -313,7 +311,7 @@ def _plans(cases: Sequence[_Case], shape: str) -> dict[int, Trajectory]:
             plan = _planned(case.point, shape, _to_plan_with(case.found, case.point.plant))
             if isinstance(plan, DiransacError):
                 raise PlanningError(f"{shape}: {plan}")
-            plans[id(case)] = plan
+            plans[case] = plan
     return plans
 
 
@@ -341,17 +339,17 @@ def _planned(point: _Point, shape: str, parameters: tuple[float, ...]) -> Trajec
         return error
 
 
-def _controllers(cases: Sequence[_Case], plans: dict[int, Trajectory], control: ControlChoice) -> dict[int, Controller]:
+def _controllers(plans: Mapping[_Case, Trajectory], control: ControlChoice) -> dict[_Case, Controller]:
     """Controller of each case that has one."""
-    with _timed(cases, "steer"):
+    with _timed(plans, "steer"):
         steer = partial(tvlqr_batch, **control.weights, threads=1)
-        steering = together(steer, [case.found for case in cases], [plans[id(case)] for case in cases])
+        steering = together(steer, [case.found for case in plans], list(plans.values()))
     found = {}
-    for case, one in zip(cases, steering, strict=True):
+    for case, one in zip(plans, steering, strict=True):
         if isinstance(one, Exception):
             case.fail(one)
         else:
-            found[id(case)] = control.limited(one)
+            found[case] = control.limited(one)
     return found
 
 

@@ -42,9 +42,6 @@ _N_DRAWS = 9
 """Plain multisines; the median one is the comparison, and the best one the start of the optimisation."""
 
 
-_FEWEST_HARMONICS = 4
-"""With these a period is always long enough for two."""
-
 _ROOM = 1e-3
 """Fraction of a limit that is left for extremes between the rows of the check."""
 
@@ -392,8 +389,9 @@ def _check_times(time: FloatArray, series: FourierSeries) -> FloatArray:
 
 def _series(duration: float, frequency: float, harmonics: int) -> FourierSeries:
     """Series with a whole number of periods.  Raises SettingsError: numbers that do not fit together."""
-    if not (np.ndim(harmonics) == 0 and harmonics >= _FEWEST_HARMONICS and harmonics == int(harmonics)):
-        raise SettingsError(f"harmonics is {harmonics!r:.60}; give a whole number of at least {_FEWEST_HARMONICS}")
+    # With 4 a period is always long enough for two.
+    if not (np.ndim(harmonics) == 0 and harmonics >= 4 and harmonics == int(harmonics)):
+        raise SettingsError(f"harmonics is {harmonics!r:.60}; give a whole number of at least 4")
     cycles = duration * frequency * (1.0 + 1e-9)
     if not cycles >= 2.0:
         raise SettingsError(

@@ -27,10 +27,6 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.flight.planning.excitation import FourierSeries, Limited, Observed, grid, motion_of
 
-_LAST_BARRIER, _BARRIER_FACTOR = 1e-4, 0.3
-"""Last barrier parameter, and what it is reduced by: it is the change of the objective per active limit."""
-
-
 _FRACTION = 0.99
 """Of the way to a limit that a step may take."""
 
@@ -185,6 +181,7 @@ def best_motion(problem: DesignProblem, search: Search, barrier: float) -> Float
     Nocedal and Wright 2006, "Numerical Optimization", chapter 19 and procedure 18.2.
     """
     at, mu = problem.point(problem.unknowns()), barrier
+    last = 1e-4  # barrier parameter: the change of the objective per active limit
     multipliers, hessian, before = mu / at.c, np.eye(len(at.x)), np.inf
     search.converged = False
     while search.goes_on():
@@ -200,8 +197,8 @@ def best_motion(problem: DesignProblem, search: Search, barrier: float) -> Float
         # Decrease of the barrier function per unknown, over the barrier parameter, below which that is
         # reduced.
         if before - merit < 1e-2 * mu * len(at.x):
-            search.converged = mu <= _LAST_BARRIER
-            mu, merit = max(_LAST_BARRIER, _BARRIER_FACTOR * mu), np.inf
+            search.converged = mu <= last
+            mu, merit = max(last, 0.3 * mu), np.inf
         before = merit
     return problem.coefficients(at.x)
 

@@ -12,16 +12,13 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.solver import TIME_LIMIT, Solution, Strategy, interior_point
-from diransac.flight.planning.task import TIME_STEP, InputLimits, Reference, Task, sampled, task_of
+from diransac.flight.planning.task import TIME_STEP, Reference, Task, sampled, task_of
 from diransac.flight.planning.transcription import Guess, Program
-from diransac.flight.trajectory import Trajectory
+from diransac.flight.trajectory import InputLimits, Trajectory, half_ranges
 
 if TYPE_CHECKING:
     from diransac.model import Model
     from diransac.model.plant import ModelWithParameters
-
-_DIGITS = 9
-"""Decimals of a time in s, within which equal moments computed in different ways agree."""
 
 
 def plan(
@@ -204,9 +201,10 @@ def _straight(task: Task, durations: FloatArray) -> Guess:
     Velocities are slopes of the coordinates where neither a waypoint nor the reference gives them.
     """
     model, n_q = task.model, task.model.n_q
-    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), _DIGITS)
+    decimals = 9  # of a time in s, within which equal moments computed in different ways agree
+    at_waypoints = np.round(np.concatenate([[0.0], np.cumsum(durations)]), decimals)
     rows = np.linspace(0.0, at_waypoints[-1], 1 + int(np.rint(at_waypoints[-1] / TIME_STEP)))
-    time = np.union1d(np.round(rows, _DIGITS), at_waypoints)
+    time = np.union1d(np.round(rows, decimals), at_waypoints)
     states, followed = np.zeros((len(time), len(model.state))), sampled(task.reference, time)
     fixed = np.full((len(at_waypoints), len(model.state)), np.nan)
     for known, waypoint in zip(fixed, task.waypoints, strict=True):
@@ -279,7 +277,7 @@ def _binding(task: Task, states: FloatArray, inputs: FloatArray) -> str:
         (states[1:], task.states, task.model.state),
     ):
         # Fraction of a range, or of a unit, within which a value is at its limit.
-        slack = 1e-3 * limits.half_ranges
+        slack = 1e-3 * half_ranges(limits.lower, limits.upper)
         at_limit = np.any((values <= limits.lower + slack) | (values >= limits.upper - slack), axis=0)
         names += [known[j] for j in np.flatnonzero(at_limit)]
     return " and ".join(names)

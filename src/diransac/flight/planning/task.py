@@ -11,6 +11,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import PlanningError, SettingsError
+from diransac.flight.trajectory import InputLimits, half_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -21,13 +22,8 @@ if TYPE_CHECKING:
 TIME_STEP = 0.01
 """Time from row to row of a plan, s: flights are simulated and controlled at 100 Hz."""
 
-InputLimits: TypeAlias = Mapping[str, tuple[float, float]]
-"""Smallest and largest value by name."""
-
 Reference: TypeAlias = "Mapping[str, Callable[[FloatArray], ArrayLike] | ArrayLike]"
 """State -> function of time in s, or samples evenly spaced from start to end."""
-
-_TRIM_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -60,12 +56,6 @@ class Limits:
         """Limits at this fraction of the range from trim (n,) to each limit; unchanged for a trim beyond it."""
         lower, upper = (trim + fraction * (limit - trim) for limit in (self.lower, self.upper))
         return Limits(np.maximum(self.lower, lower), np.minimum(self.upper, upper))
-
-    @property
-    def half_ranges(self) -> FloatArray:
-        """Half the range between the limits (n,); 1 where it is zero or infinite."""
-        half = 0.5 * (self.upper - self.lower)
-        return np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
 
 @dataclass(frozen=True)
@@ -150,7 +140,7 @@ def task_of(
         start=start,
         reference=dict(reference or {}),
         state_weights=_weights_of("state_weights", "state", state_weights, model.state, followed),
-        input_weights=of_inputs / limits.half_ranges**2,
+        input_weights=of_inputs / half_ranges(limits.lower, limits.upper) ** 2,
         trim=at_trim,
         time_weight=float(time_weight) if rows is None else 0.0,
         inputs=limits.around(at_trim, input_limit_fraction),
@@ -359,7 +349,7 @@ def _rest_inputs(model: Model, parameters: FloatArray, x: FloatArray, free: Bool
     Raises PlanningError: there are none within the limits, or none at all.
     """
     trim, residual, _ = _least_acceleration(model, parameters, x, free, limits)
-    tolerance = _TRIM_TOLERANCE * (1.0 + np.abs(_accelerations(model, parameters, x, np.zeros(model.n_u))).max())
+    tolerance = 1e-6 * (1.0 + np.abs(_accelerations(model, parameters, x, np.zeros(model.n_u))).max())
     if np.abs(residual).max() <= tolerance:
         return trim
     shown = [j for j, n in enumerate(model.state) if n in model.coordinates or (n in model.first_order and not free[j])]

@@ -8,7 +8,7 @@ The paper leaves these choices open; they were fixed before any result was compu
   without the weight several plans have about the same cost, some overshoot by more than 3 m, and the solver and its
   first guess decide which one is found;
 - the sine has two periods of 4 m along x, from the origin, in 12 s; an error of 0.1 m costs as much as full use of an
-  input (`POSITION_WEIGHT`);
+  input;
 - the inputs of a rotorcraft stay within `ROTORCRAFT_LIMITS`, of which a plan uses the fraction
   `INPUT_LIMIT_FRACTION`, counted from hover: feedback keeps authority for any identified mass.
 """
@@ -28,8 +28,8 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import SettingsError
 from diransac.flight.planning.planner import plan
-from diransac.flight.planning.task import TIME_STEP, InputLimits
-from diransac.flight.trajectory import Trajectory
+from diransac.flight.planning.task import TIME_STEP
+from diransac.flight.trajectory import InputLimits, Trajectory
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -45,9 +45,6 @@ ROTORCRAFT_LIMITS = {"thrust": (0.0, 5.0), "moment": (-1.0, 1.0)}
 """N: twice the weight of the paper's rotorcraft, and the largest difference between its rotors."""
 
 INPUT_LIMIT_FRACTION = 0.8
-
-POSITION_WEIGHT = 1.0 / 0.1**2
-"""1/(m^2 s)."""
 
 ROUTE_WEIGHT = 1.0 / 1.0**2
 """1/(m^2 s)."""
@@ -85,7 +82,7 @@ def square(
         Smallest and largest value of each input, in its unit. By default thrust 0 to 5 N and moment -1 to 1 N for a
         model with these inputs, none for others.
     **options
-        Further arguments of `plan`, such as ``solver`` or ``guess``.
+        Further arguments of `plan`, such as ``guess``.
 
     Returns
     -------
@@ -192,7 +189,7 @@ def sine(
     fixed: dict[str, Any] = {
         "reference": {"x": along, "z": height},
         "duration": duration,
-        "state_weights": {"x": POSITION_WEIGHT, "z": POSITION_WEIGHT},
+        "state_weights": dict.fromkeys("xz", 1.0 / 0.1**2),  # 1/(m^2 s)
         "input_weights": input_weights,
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
@@ -228,7 +225,7 @@ def _through(
             name: partial(np.interp, xp=times, fp=list(x))
             for name, x in zip("xz", zip(*points, strict=True), strict=True)
         },
-        "state_weights": {"x": ROUTE_WEIGHT, "z": ROUTE_WEIGHT},
+        "state_weights": dict.fromkeys("xz", ROUTE_WEIGHT),
     }
     return plan(plant, **fixed, **_limits(plant.model, input_limits), **options)
 

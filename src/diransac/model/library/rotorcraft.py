@@ -163,8 +163,9 @@ def extended_rotorcraft(
     known = Plant(model, parameters)
     check_possible(model, known.parameters)
     disturbances = [rotors.imbalance(model, constants, rotor_phase, known.parameters["mass"])]
-    if any(_per_rotor(flapping=blade_flapping).values()):
-        disturbances.append(rotors.flapping(model, _per_rotor(flapping=blade_flapping)))
+    flapping = _per_rotor(flapping=blade_flapping)
+    if any(flapping.values()):
+        disturbances.append(rotors.flapping(model, flapping))
     return Plant(model, parameters, tuple(disturbances))
 
 

@@ -65,7 +65,7 @@ def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, f
 
 def _set(document: Document, compiled: Any, unknown: Unknown, kind: str, name: str) -> None:
     """Write the field of an element."""
-    field, _ = unknown.field
+    field = unknown.field
     sections = {"actuator": "actuator", "tendon": "tendon", "equality": "equality", "pair": "contact"}
     element = document.named(kind, name, sections.get(kind, "worldbody"))
     if kind == "body" and field in ("mass", "ipos", "inertia"):

@@ -21,16 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class JointColumns:
-    """Columns of the state that a joint has.
+    """Columns of the state that a joint has: coordinates and velocities with units by name, names of accelerations."""
 
-    Parameters
-    ----------
-    name : str
-    coordinates, velocities, accelerations : dict of str to str
-        Unit by name.
-    """
-
-    name: str
     coordinates: dict[str, str]
     velocities: dict[str, str]
     accelerations: tuple[str, ...]
@@ -220,10 +212,9 @@ def joint_columns(compiled: Any) -> Iterator[JointColumns]:
         else:
             name = identifier(joint.name or f"joint_{k}")
             unit = "m" if kind == kinds.mjJNT_SLIDE else "rad"
-            position, velocity = {name: unit}, {f"{name}_dot": f"{unit}/s"}
-            yield JointColumns(name, position, velocity, (f"{name}_ddot",))
+            yield JointColumns({name: unit}, {f"{name}_dot": f"{unit}/s"}, (f"{name}_ddot",))
             continue
-        yield JointColumns(name, position, velocity, tuple(f"{x}_dot" for x in velocity))
+        yield JointColumns(position, velocity, tuple(f"{x}_dot" for x in velocity))
 
 
 _UNITS = {

@@ -135,11 +135,11 @@ class Unknown:
     columns: tuple[str, ...] = ()
 
     @property
-    def field(self) -> tuple[str, int]:
-        """Field that it is an entry of, and the index of the entry."""
+    def field(self) -> str:
+        """Field that it is an entry of."""
         found = _MASK.fullmatch(self.name)
         assert found is not None
-        return found["field"], int(found["index"] or 0)
+        return found["field"]
 
 
 def unknowns_of(

@@ -20,7 +20,7 @@ from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text
 
 if TYPE_CHECKING:
-    from diransac.model.mjcf.description import JointColumns, SensorColumns
+    from diransac.model.mjcf.description import SensorColumns
     from diransac.model.robots.actuation import Actuation
 
 
@@ -112,7 +112,7 @@ class MujocoModel(Model):
     ) -> None:
         self.text, self.unknowns, self.constants = text, tuple(unknowns), tuple(constants)
         compiled = compiled_of(f'model "{name}"', text)
-        joints: list[JointColumns] = list(joint_columns(compiled))
+        joints = list(joint_columns(compiled))
         coordinates = {n: unit for x in joints for n, unit in x.coordinates.items()}
         velocities = {n: unit for x in joints for n, unit in x.velocities.items()}
         derived = len(coordinates) == len(velocities)
@@ -260,7 +260,7 @@ class MujocoModel(Model):
         if len(kept) == len(self.sensors):
             return self
         left = [x for x in self.unknowns if not x.columns or set(x.columns) & set(kept)]
-        return self._other(unknowns=left, sensors=kept)
+        return MujocoModel(self.name, self.text, left, self.inputs, constants=self.constants, sensors=kept)
 
     def with_fixed(self, values: Mapping[str, float]) -> MujocoModel:
         """The model in which parameters are constants."""
@@ -268,13 +268,8 @@ class MujocoModel(Model):
             return self
         fixed = [(x, float(values[x.name])) for x in self.unknowns if x.name in values]
         left = [x for x in self.unknowns if x.name not in values]
-        return self._other(unknowns=left, constants=(*self.constants, *fixed))
-
-    def _other(self, **changes: Any) -> MujocoModel:
-        kept = {"unknowns": self.unknowns, "constants": self.constants, "sensors": self._given_sensors}
-        kept |= changes
-        unknowns: Any = kept.pop("unknowns")
-        return MujocoModel(self.name, self.text, unknowns, self.inputs, **kept)  # type: ignore[arg-type]  # by name
+        constants, sensors = (*self.constants, *fixed), self._given_sensors
+        return MujocoModel(self.name, self.text, left, self.inputs, constants=constants, sensors=sensors)
 
     # ------------------------------------------------------------------ identity and storage
 

@@ -61,7 +61,7 @@ class JointTorques(_Saturating):
         A limit is not positive, or the pattern lacks ``{}``.
     """
 
-    torque: str = "{}_torque"
+    torque: str = FORCE
     limit: PerJoint | None = None
 
     def __post_init__(self) -> None:

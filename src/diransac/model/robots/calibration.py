@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -52,17 +52,25 @@ def calibrated(
     """
     description = read_description(path, "held")
     source = Path(path).read_bytes()
-    found = _estimates(description, parameters, values, covariance)
+    of_joints, of_bodies = _estimates(description, parameters, values, covariance)
     document = Document(source, f'robot description "{path}"')
     # Attributes of a joint, and of a URDF joint's dynamics, by parameter.
     of_mjcf = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
     attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else of_mjcf
-    for name, of_joint in found.joints.items():
-        joint = next(x for x in description.joints if x.name == name)
-        document.set_joint(joint, {attributes[kind]: x for kind, x in of_joint.items() if kind in attributes})
-    for name, inertial in found.bodies.items():
+    texts, placed = dict[str, dict[str, float]](), set[str]()
+    for place, value in of_joints.items():
+        kind, _, name = place.partition(" ")
+        own = texts.setdefault(name, {})
+        if kind in attributes:
+            own[attributes[kind]] = value
+            placed.add(place)
+    joints = {x.name: x for x in description.joints}
+    for name, own in texts.items():
+        if name not in joints:
+            raise ModelError(f'there is no joint "{name}" in the description')
+        document.set_joint(joints[name], own)
+    for name, inertial in of_bodies.items():
         document.set_body(name, inertial)
-    placed = {f"{kind} {name}" for name, of_joint in found.joints.items() for kind in of_joint if kind in attributes}
     left_out = [
         n
         for (n, x), value in zip(parameters.items(), values, strict=True)
@@ -103,68 +111,40 @@ def impossible_changes(
 # ---------------------------------------------------------------------- values
 
 
-@dataclass(frozen=True)
-class _Estimates:
-    """New values: of each joint by parameter, and the ten inertial parameters of each body."""
-
-    joints: dict[str, dict[str, float]] = field(default_factory=dict)
-    bodies: dict[str, FloatArray] = field(default_factory=dict)
-
-
 def _estimates(
     description: Description, parameters: Mapping[str, Parameter], values: FloatArray, covariance: FloatArray
-) -> _Estimates:
-    """Values of everything that a parameter stands for, or is a part of."""
+) -> tuple[dict[str, float], dict[str, FloatArray]]:
+    """Parameters of joints by place, such as ``armature elbow``, and the ten inertial parameters of bodies by name."""
     places = {n: dict(x.combination) for n, x in parameters.items()}
     if not all(places.values()):
         raise ModelError(f"{next(n for n, x in places.items() if not x)} is no parameter of a robot's description")
-    found = _Estimates()
-    estimated = [(k, n) for k, n in enumerate(places) if not np.isnan(values[k])]
-    for k, n in estimated:
-        if not _has_inertials(places[n]):
-            _assign(found, next(iter(places[n])), values[k])
-    names = list(places)
-    known = [k for k, n in estimated if _has_inertials(places[n]) and np.isfinite(covariance[k, k])]
-    if known:
-        of_known = [places[names[k]] for k in known]
-        _solve_inertials(found, description, of_known, values[known], covariance[np.ix_(known, known)])
-    return found
+    of_joints, known = dict[str, float](), list[int]()
+    for k, own in enumerate(places.values()):
+        if not np.isnan(values[k]):
+            if not _has_inertials(own):
+                of_joints[next(iter(own))] = float(values[k])
+            elif np.isfinite(covariance[k, k]):
+                known.append(k)
+    if not known:
+        return of_joints, {}
+    every = list(places.values())
+    names, constants, combinations = _combinations([every[k] for k in known])
+    bodies, joints = {x.name: x for x in description.bodies}, {x.name: x for x in description.joints}
+    missing = [name for name in names if name not in bodies]
+    if missing:
+        raise ModelError(f'there is no body "{missing[0]}" in the description')
+    inertials, others = consistent_parameters(
+        np.array([inertial_parameters(bodies[name].inertial) for name in names]),
+        np.array([joints[place.partition(" ")[2]].armature for place in constants]),
+        combinations,
+        values[known],
+        covariance[np.ix_(known, known)],
+    )
+    return of_joints | dict(zip(constants, others.tolist(), strict=True)), dict(zip(names, inertials, strict=True))
 
 
 def _has_inertials(places: Mapping[str, float]) -> bool:
     return any(place.partition(" ")[0] in INERTIAL_NAMES for place in places)
-
-
-def _assign(found: _Estimates, place: str, value: float) -> None:
-    kind, _, name = place.partition(" ")
-    found.joints.setdefault(name, {})[kind] = float(value)
-
-
-def _solve_inertials(
-    found: _Estimates,
-    description: Description,
-    places: list[dict[str, float]],
-    values: FloatArray,
-    covariance: FloatArray,
-) -> None:
-    """Bodies and constants of joints that explain base parameters."""
-    names, constants, combinations = _combinations(places)
-    described = {x.name: x for x in description.bodies}
-    missing = [name for name in names if name not in described]
-    if missing:
-        raise ModelError(f'there is no body "{missing[0]}" in the description')
-    bodies = [described[name] for name in names]
-    joints = {x.name: x for x in description.joints}
-    inertials, others = consistent_parameters(
-        np.array([inertial_parameters(x.inertial) for x in bodies]),
-        np.array([joints[place.partition(" ")[2]].armature for place in constants]),
-        combinations,
-        values,
-        covariance,
-    )
-    found.bodies.update({body.name: x for body, x in zip(bodies, inertials, strict=True)})
-    for place, value in zip(constants, others, strict=True):
-        _assign(found, place, value)
 
 
 def _combinations(places: list[dict[str, float]]) -> tuple[list[str], list[str], FloatArray]:

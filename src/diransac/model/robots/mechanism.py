@@ -1,4 +1,9 @@
-"""Forces of a robot's joints by what is known and unknown of it, as the equations and parameters of a model."""
+"""Forces of a robot's joints by what is known and unknown of it, as the equations and parameters of a model.
+
+Forces are linear in the parameters, ``F = Y(q, v, a) x``.  Columns of Y that vanish, or that are combinations of others
+for every motion, are found numerically, from many random motions (Gautier 1991, "Numerical calculation of the base
+inertial parameters of robots", Journal of Robotic Systems 8(4)).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +16,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.robots.actuation import Actuation
-from diransac.model.robots.base_parameters import base_parameters
 from diransac.model.robots.description import Coupling, Description, Joint
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters, inverse_dynamics, pseudo_inertia
 
@@ -143,14 +148,14 @@ class Mechanism:
         values = dict(zip(names, ca.vertsplit(x), strict=True))
         base = [ca.SX.sym("base", 3) for _ in self._base_inputs]
         forces = ca.vertcat(*self.forces(at[0], at[1], at[2], values, base).values())
-        found = base_parameters(ca.Function("regressor", [q, v, a, *base], [ca.densify(ca.jacobian(forces, x))]))
-        unseen = {names[k] for k in found.vanishing}
+        regressor = ca.Function("regressor", [q, v, a, *base], [ca.densify(ca.jacobian(forces, x))])
+        found = _base_parameters(regressor, names)
+        seen = {name for weights in found.values() for name in weights}
         for i in self.bodies:
             body = self.description.bodies[i].name
-            if all(f"{kind}_{identifier(body)}" in unseen for kind in INERTIAL_NAMES):
+            if not any(f"{kind}_{identifier(body)}" in seen for kind in INERTIAL_NAMES):
                 raise ModelError(f'{self.label}: body "{body}" does not move with the joints; leave it out of bodies')
-        combinations = [found.combination(i) for i in range(len(found.kept))]
-        return {names[k]: {names[l]: w for l, w in x.items()} for k, x in zip(found.kept, combinations, strict=True)}
+        return found
 
     def parameters(self, driven: Collection[str]) -> dict[str, Parameter]:
         """Base parameters, and those of drives and encoders."""
@@ -235,6 +240,66 @@ class Mechanism:
         curvature = sum(k * (k - 1) * b * x ** (k - 2) for k, b in enumerate(c) if k > 1)
         a = slope * leader.a + curvature * leader.v**2
         return _Motion(y, slope * leader.v, a, slope * leader.slope, leader.coordinate)
+
+
+# ---------------------------------------------------------------------- base parameters
+
+
+def _base_parameters(regressor: ca.Function, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Weights of the parameters that each base parameter combines, by the name of the first of them.
+
+    Parameters that no motion shows are in none.
+
+    Parameters
+    ----------
+    regressor : casadi.Function
+        ``(q, v, a) -> Y (n, n_x)``, or ``(q, v, a, w, dw, f) -> Y`` with the motion of a base.
+    names : (n_x,) sequence of str
+    """
+    n, n_x = regressor.size1_in(0), len(names)
+    # Rounding error of a column relative to the largest, and of weights between columns of unit length.
+    rounding = 1e-9
+    rng = np.random.default_rng(0)
+    n_points = 3 * n_x // n + 10
+    sizes = [regressor.size1_in(k) for k in range(regressor.n_in())]
+    # Of random motions: position, velocity, acceleration; angular velocity and acceleration of a base, specific
+    # force.
+    motion = [
+        rng.uniform(-x, x, (size, n_points))
+        for x, size in zip((np.pi, 3.0, 10.0, 3.0, 10.0, 15.0), sizes, strict=False)
+    ]
+    stacked = np.hsplit(np.array(ca.densify(regressor(*motion))), n_points)
+    Y = np.vstack(stacked)
+    lengths = np.linalg.norm(Y, axis=0)
+    seen = lengths > rounding * lengths.max()
+    Y, lengths = np.where(seen, Y / np.where(seen, lengths, 1.0), 0.0), np.where(seen, lengths, 1.0)
+    kept = _independent_columns(Y)
+    dropped = [k for k in range(n_x) if k not in kept]
+    weights = np.linalg.lstsq(Y[:, kept], Y[:, dropped])[0] if kept and dropped else np.zeros((len(kept), len(dropped)))
+    weights[np.abs(weights) < rounding] = 0.0
+    weights *= lengths[dropped] / lengths[kept, None]
+    # Decimal digits of weights, which are products of lengths in m.
+    rows = np.round(weights, 10).tolist()
+    return {
+        names[k]: {names[k]: 1.0, **{names[l]: w for l, w in zip(dropped, row, strict=True) if w != 0.0}}
+        for k, row in zip(kept, rows, strict=True)
+    }
+
+
+def _independent_columns(Y: FloatArray) -> list[int]:
+    """Indices of the columns of unit length that are no combination of those before them, by Gram-Schmidt, twice."""
+    kept, basis = list[int](), np.zeros((len(Y), 0))
+    for k, column in enumerate(Y.T):
+        rest = column - basis @ (basis.T @ column)
+        rest = rest - basis @ (basis.T @ rest)
+        size = float(np.linalg.norm(rest))
+        # Share of a column, at most, that is left of it beside the others where it is their combination.
+        # Angles in descriptions are rounded: 1.5708 is a right angle. What such an error shows of a parameter
+        # is nothing.
+        if size > 1e-4:
+            kept.append(k)
+            basis = np.column_stack([basis, rest / size])
+    return kept
 
 
 # ---------------------------------------------------------------------- forces of a joint
