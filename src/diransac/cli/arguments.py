@@ -252,7 +252,7 @@ def is_description(text: str) -> bool:
     return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
-def _is_result(text: str) -> bool:
+def is_result(text: str) -> bool:
     """True for the name of a result, ``.json``."""
     return Path(text).suffix.lower() == ".json"
 
@@ -273,7 +273,7 @@ def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
     ResultError
         The result cannot be loaded.
     """
-    if model is None or not _is_result(model):
+    if model is None or not is_result(model):
         return ()
     from diransac.identification.result import Result
 
@@ -282,7 +282,7 @@ def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
 
 def model_file(text: str) -> Path | None:
     """The file of ``file.py[:name]``, of a robot's description or of a result; None for a built-in model's name."""
-    if is_description(text) or _is_result(text):
+    if is_description(text) or is_result(text):
         return Path(text)
     found = file_and_name(text, "model")
     return None if found is None else found[0]
@@ -298,7 +298,7 @@ def load_model(text: str) -> Model:
     ResultError
         The result cannot be loaded.
     """
-    if _is_result(text):
+    if is_result(text):
         from diransac.identification.result import Result
 
         return Result.load(text).model
