@@ -94,10 +94,8 @@ class Group(TyperGroup):
         given = list(sys.argv[1:] if args is None else args)
         words = [word for word in given if word not in ("--debug", "--progress-json", *_VERBOSITY)]
         extra["standalone_mode"] = False
-        screen.set_command(given)
         levels = [_VERBOSITY[word] for word in given if word in _VERBOSITY]
-        screen.set_verbosity(levels[-1] if levels else 0)
-        screen.set_for_programs("--progress-json" in given)
+        screen.begin(given, levels[-1] if levels else 0, for_programs="--progress-json" in given)
         debugging = "--debug" in given
         try:
             code = super().main(_configured(words), *positional, **extra)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import io
-import json
 import tokenize
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
@@ -21,7 +20,8 @@ from starlette.routing import Route
 
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.limits import read_bytes
-from diransac.plain_text import one_line, printable
+from diransac.plain_data import json_data, json_text
+from diransac.plain_text import printable
 from diransac.studio.folders import Folders
 from diransac.studio.jobs import Jobs
 from diransac.studio.project import NAME, Project
@@ -435,8 +435,6 @@ def _endpoint(studio: Studio, call: Endpoint) -> Callable[[Request], Awaitable[R
 
 async def _body(request: Request) -> dict[str, Any]:
     """The request's JSON.  Raises SettingsError: it is none."""
-    from diransac.plain_data import json_data
-
     if request.headers.get("content-type") != "application/json":
         raise SettingsError("the body is not JSON")
     found = json_data(await request.body())
@@ -446,16 +444,7 @@ async def _body(request: Request) -> dict[str, Any]:
 
 
 def _json(data: Any) -> str:
-    return one_line(printable(json.dumps(_finite(data), ensure_ascii=False)))
-
-
-def _finite(data: Any) -> Any:
-    """Data in which numbers that are not finite are None."""
-    if isinstance(data, float):
-        return data if np.isfinite(data) else None
-    if isinstance(data, Mapping):
-        return {str(key): _finite(value) for key, value in data.items()}
-    return [_finite(value) for value in data] if isinstance(data, list | tuple) else data
+    return printable(json_text(data))
 
 
 def _answer(data: Mapping[str, Any], status: int = 200) -> Response:
