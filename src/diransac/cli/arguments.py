@@ -15,7 +15,7 @@ from diransac.identification.methods import WITH_ESTIMATOR, configured, estimato
 from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
 from diransac.plain_data import toml_file, toml_table
-from diransac.user_files import definitions, file_and_name
+from diransac.user_files import definitions, file_and_name, is_description
 
 # ---------------------------------------------------------------------- lists of pairs
 
@@ -245,11 +245,6 @@ def _none_where_meant(key: str, value: object) -> object:
 
 
 # ---------------------------------------------------------------------- models
-
-
-def is_description(text: str) -> bool:
-    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
-    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
 def is_result(text: str) -> bool:

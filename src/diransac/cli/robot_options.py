@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from diransac.cli.arguments import is_description, load_model, names, pairs
+from diransac.cli.arguments import load_model, names, pairs
 from diransac.model import Model
 from diransac.model.parts import independent_parts
+from diransac.user_files import is_description
 
 if TYPE_CHECKING:
     from diransac.model.robots import Actuation, MotorCurrents, PositionControl

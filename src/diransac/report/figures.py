@@ -21,7 +21,6 @@ Tick = tuple[str, str]
 """Position in percent of an axis, and text."""
 
 _HEIGHT = 1000
-_FARTHEST = 10**6
 _MARGIN = 0.06
 
 
@@ -52,7 +51,7 @@ class Scale:
     def height(self, values: npt.ArrayLike) -> IntArray:
         """Thousandths of the range from its top; values far outside are clipped."""
         part = (self.high - np.asarray(values, dtype=float)) / (self.high - self.low)
-        return np.rint(np.clip(_HEIGHT * part, -_FARTHEST, _FARTHEST)).astype(np.int64)
+        return np.rint(np.clip(_HEIGHT * part, -(10**6), 10**6)).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ from diransac.data.log import Log
 from diransac.identification.diagnosis import Diagnosis
 from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Run
-from diransac.text_table import number, percent, plural, share
+from diransac.text_table import number, percent, plural, share, some
 
 _VISIBLE = 0.01
-_STRETCHES = 6
 
 
 @dataclass(frozen=True)
@@ -231,9 +230,8 @@ def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
             found.append((start, stop, "samples are missing"))
     if not found:
         return []
-    listed = [f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)[:_STRETCHES]]
-    more = f" and {len(found) - _STRETCHES} more" if len(found) > _STRETCHES else ""
-    return [f"Left out: {', '.join(listed)}{more}."]
+    listed = some((f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)), 6)
+    return [f"Left out: {listed}."]
 
 
 # ---------------------------------------------------------------------- residuals

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -356,15 +357,15 @@ def scores(run: Run) -> tuple[str, list[Table]]:
 
 def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
     """Scores of one horizon, beside those of trivial predictions; robust ones where samples are left out of them."""
-    robust = any(x > 0.0 for x in validation.outlier_fraction.values())
+    robust, three_digits = any(x > 0.0 for x in validation.outlier_fraction.values()), partial(number, digits=3)
     columns: list[tuple[str, Mapping[str, float], Callable[[float], str]]] = [
         ("RMSE", at.rmse, number),
         *([("robust RMSE", at.robust_rmse, number)] if robust else []),
         ("hold last", at.hold_last, number),
         ("const. vel.", at.constant_velocity, number),
         ("relative error", at.relative_error, percent),
-        ("fit %", at.fit_percent, _three_digits),
-        *([("robust fit %", at.robust_fit_percent, _three_digits)] if robust else []),
+        ("fit %", at.fit_percent, three_digits),
+        *([("robust fit %", at.robust_fit_percent, three_digits)] if robust else []),
         ("R²", at.r_squared, _r_squared),
         *([("robust R²", at.robust_r_squared, _r_squared)] if robust else []),
     ]
@@ -376,10 +377,6 @@ def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Tab
     lost = f", {at.diverged} diverged" if at.diverged else ""
     header = ("Signal", "Unit", *(title for title, _, _ in columns))
     return Table(header, rows, f"{label}: {at.name}{judged} ({plural(at.windows, 'window')}{lost})")
-
-
-def _three_digits(x: float) -> str:
-    return number(x, 3)
 
 
 def _innovation_table(label: str, one: Innovations, validation: Validation) -> Table:

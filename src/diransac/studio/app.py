@@ -22,7 +22,7 @@ from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.limits import read_bytes
 from diransac.plain_data import json_data, json_text
 from diransac.plain_text import printable
-from diransac.studio.folders import Folders
+from diransac.studio.folders import MODELS, Folders
 from diransac.studio.jobs import Jobs
 from diransac.studio.project import NAME, Project
 from diransac.studio.scene import Scenes
@@ -224,7 +224,7 @@ class Studio:
 
 def _first_project(named: list[str]) -> Project:
     """A project of the files that were named: logs, and a model."""
-    models = [name for name in named if name.endswith((".urdf", ".mjcf", ".xml", ".py", ".json"))]
+    models = [name for name in named if name.endswith(MODELS)]
     return Project(logs=[name for name in named if name not in models], model=next(iter(models), None))
 
 

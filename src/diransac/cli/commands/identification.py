@@ -27,7 +27,7 @@ from diransac.cli.options import (
     StrictFlag,
     known_methods,
 )
-from diransac.cli.outputs import PAGE, RESULT, STDOUT, check_ending, checked, staged
+from diransac.cli.outputs import PAGE, STDOUT, check_ending, checked, staged
 from diransac.cli.robot_options import RobotOptions
 from diransac.cli.rows import FleetOptions
 from diransac.data.log import Log
@@ -105,7 +105,7 @@ def _identify(
         )
         return
     checked([output, report], read)
-    check_ending(output, RESULT)
+    check_ending(output, (".json",))
     check_ending(report, PAGE)
     limbs, results = robot.load_limbs(model), dict[str, Result]()
     if len(limbs) > 1 and output == STDOUT:
@@ -147,7 +147,6 @@ def _compare(
     wanted = search.methods(known_methods(methods))
     arguments = search.arguments() | preparation.completed(derivation).arguments()
     read = [*files, model_file(model), search.settings]
-    checked([report], read)
     check_ending(report, PAGE)
     with staged([report], read) as (page,):
         plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))

@@ -13,7 +13,7 @@ import typer
 from diransac.cli import screen
 from diransac.cli.arguments import names, toml_value
 from diransac.cli.options import JsonFlag
-from diransac.cli.outputs import PAGE, check_ending, checked, staged
+from diransac.cli.outputs import PAGE, check_ending, staged
 from diransac.cli.rows import Cluster, Jobs, running
 from diransac.errors import SettingsError
 from diransac.identification.methods import METHODS
@@ -156,7 +156,6 @@ def _report(store: StoreArgument, output: Page) -> None:
     """Write a store as one HTML page: figures, tables, failures and run times."""
     from diransac.report.stores import write_study_report
 
-    checked([output], [store])
     check_ending(output, PAGE)
     with staged([output], [store]) as (written,):
         write_study_report(store, written)
@@ -235,7 +234,6 @@ def _fleet_report(store: StoreArgument, output: Page) -> None:
     """Write a store as one HTML page: findings, figures, tables and failures."""
     from diransac.report.stores import write_fleet_report
 
-    checked([output], [store])
     check_ending(output, PAGE)
     with staged([output], [store]) as (written,):
         write_fleet_report(summarise_fleet(store), written)
