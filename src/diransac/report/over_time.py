@@ -11,7 +11,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
 from diransac.identification.diagnosis import Diagnosis
-from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
+from diransac.report.figures import Figure, Plot, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Run
 from diransac.text_table import number, percent, plural, share, some
 
@@ -128,7 +128,7 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Ti
         title=name,
         unit=unit,
         facts=(f"median error{':' * (len(runs) > 1)} {'; '.join(facts)}",),
-        panels=(Panel(plot), _residuals(name, having, shown, timeline)),
+        plots=(plot, _residuals(name, having, shown, timeline)),
         time_ticks=time_axis(timeline),
         beyond=_beyond_text(beyond),
     )
@@ -237,7 +237,7 @@ def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
 # ---------------------------------------------------------------------- residuals
 
 
-def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Panel:
+def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Plot:
     """Simulated minus measured, with the inlier threshold, or with three standard deviations of the noise."""
     traces, ranges = [], []
     for i, run in having:
@@ -253,8 +253,8 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
     scale = _residual_scale(ranges, [run is shown for _, run in having], _VISIBLE * (high - low))
     note = f"; dashed: {meaning}, ±{number(level, 3)}" if levels else ""
     label = f"Residuals of {name}, simulated minus measured{note}"
-    plot = time_plot(traces, scale, timeline, label, look="residual", levels=levels)
-    return Panel(plot, f"simulated − measured{note}")
+    heading = f"simulated − measured{note}"
+    return time_plot(traces, scale, timeline, label, heading=heading, look="residual", levels=levels)
 
 
 def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, BoolArray]:
@@ -323,9 +323,7 @@ def _unmodelled_figure(
         traces.append(Trace("suggested terms", "suggested", "line", *explained))
     label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
     plot = time_plot(traces, scale, timeline, label, levels=(0.0,), bands=bands)
-    return Figure(
-        what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
-    )
+    return Figure(what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (plot,), time_axis(timeline))
 
 
 def _steps(found: Diagnosis, values: FloatArray, timeline: Timeline) -> tuple[IntArray, FloatArray]:

@@ -19,10 +19,6 @@ from diransac.report.rendering import Table
 from diransac.report.runs import Entry, Run
 from diransac.text_table import number, percent, plural, telling_digits
 
-_LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
-"""Look of each verdict."""
-
-
 # ---------------------------------------------------------------------- summary
 
 
@@ -82,7 +78,8 @@ def card(entry: Entry) -> Card:
     verdict, (kept, n_more) = verdict_of(every), shown(every, good=True)
     few = [(about, tuple(x for x in kept if any(x is y for y in found))) for about, found in groups]
     few = [(about, found) for about, found in few if found]
-    return Card(entry.label, _LEVELS[verdict], verdict, tuple(few), n_more, next_line(every))
+    levels: dict[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
+    return Card(entry.label, levels[verdict], verdict, tuple(few), n_more, next_line(every))
 
 
 def _findings_on(run: Run) -> tuple[Finding, ...]:

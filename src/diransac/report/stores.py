@@ -22,12 +22,6 @@ from diransac.text_table import number, percent, plural
 _MOST = 200
 """Rows of a table of a fleet, findings and vehicles alike; the page says how many there are more."""
 
-_RELATIVE_TO = (
-    "Errors are relative to the best parameters that the model can reach in the same flight: least squares without "
-    "noise and without vibration. Where these differ from the plant’s own by more than 0.2 %, a second row has the "
-    "errors relative to the plant’s own. 0 is less than 0.001 %; ∞ is a missing estimate."
-)
-
 
 # Studies -------------------------------------------------------------------------------------------------------------
 def write_study_report(store: str | Path, path: str | Path) -> None:
@@ -84,7 +78,12 @@ def _parameter_sections(summary: Summary) -> Iterator[Section]:
         return
     worst = _errors(summary, None, "Error of the worst parameter, %: median over a level’s trials [worst]")
     each = {name: _errors(summary, name, f"Error of {name}, %: median [worst]") for name in estimates.errors}
-    yield Section("Error of the worst parameter", [worst, _RELATIVE_TO, each])
+    relative_to = (
+        "Errors are relative to the best parameters that the model can reach in the same flight: least squares without "
+        "noise and without vibration. Where these differ from the plant’s own by more than 0.2 %, a second row has the "
+        "errors relative to the plant’s own. 0 is less than 0.001 %; ∞ is a missing estimate."
+    )
+    yield Section("Error of the worst parameter", [worst, relative_to, each])
     yield Section("Intervals", [_intervals(summary.methods, estimates)])
 
 
