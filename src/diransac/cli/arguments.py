@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,13 +171,31 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
         if file is None
         else {key.replace("-", "_"): value for key, value in toml_file(file, "settings file").items()}
     )
-    for text in assignments:
-        key, equals, value = text.partition("=")
-        keys = [part.strip() for part in key.split(".")]
-        if not equals or not all(keys):
-            raise typer.BadParameter(f"--set: {text!r} is not key=value")
-        _assign(table, [keys[0].replace("-", "_"), *keys[1:]], toml_value(value.strip()))
+    for (first, *inner), value in assigned(assignments, "sample_size=50"):
+        _assign(table, [first.replace("-", "_"), *inner], value)
     return {key: _none_where_meant(key, value) for key, value in table.items()}
+
+
+def assigned(assignments: Sequence[str], example: str) -> Iterator[tuple[list[str], object]]:
+    """Keys ``a, b`` and value of each ``a.b=value`` of ``--set``.
+
+    Parameters
+    ----------
+    assignments : sequence of str
+    example : str
+        An assignment, for the message.
+
+    Raises
+    ------
+    typer.BadParameter
+        An assignment has another form.
+    """
+    for text in assignments:
+        path, equals, value = text.partition("=")
+        keys = [part.strip() for part in path.split(".")]
+        if not equals or not all(keys):
+            raise typer.BadParameter(f"--set: {text!r} is not key=value, such as {example}")
+        yield keys, _toml_value(value.strip())
 
 
 def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: str | None = None) -> list[Method]:
@@ -225,7 +243,7 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
     table[last] = value
 
 
-def toml_value(text: str) -> object:
+def _toml_value(text: str) -> object:
     """A TOML value; a bare word is itself."""
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
