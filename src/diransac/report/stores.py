@@ -23,6 +23,11 @@ _MOST = 200
 """Rows of a table of a fleet, findings and vehicles alike; the page says how many there are more."""
 
 
+def _write(path: str | Path, sections: Sequence[Section], **texts: str) -> None:
+    """Write a page of sections.  Raises ResultError: it cannot be written."""
+    write_page(path, "sections.html", style="study.css", sections=sections, **texts)
+
+
 # Studies -------------------------------------------------------------------------------------------------------------
 def write_study_report(store: str | Path, path: str | Path) -> None:
     """Write one HTML page about the rows of a store.
@@ -60,15 +65,7 @@ def write_study_report(store: str | Path, path: str | Path) -> None:
     computed = f"Computed by {'; '.join(summary.versions)}."
     sections.append(Section("Computing time", [_seconds(summary), computed]))
     title = " ".join(title_of(summary).split())
-    write_page(
-        path,
-        "sections.html",
-        ["page.css", "study.css"],
-        title=title,
-        heading=summary.name,
-        about=summary.description,
-        sections=sections,
-    )
+    _write(path, sections, title=title, heading=summary.name, about=summary.description)
 
 
 def _parameter_sections(summary: Summary) -> Iterator[Section]:
@@ -198,15 +195,8 @@ def write_fleet_report(summary: FleetSummary, path: str | Path) -> None:
     failed = Table(["logs", "reason"], failures, "Logs without a result, by reason") if failures else "No log failed."
     sections.append(Section("Failed logs", [failed]))
     title = f"{summary.rows.model}: a fleet of {summary.n_vehicles} vehicles"
-    write_page(
-        path,
-        "sections.html",
-        ["page.css", "study.css"],
-        title=title,
-        heading=title,
-        about=f"{status.done} logs identified, {status.failed} failed, {status.missing} missing",
-        sections=sections,
-    )
+    about = f"{status.done} logs identified, {status.failed} failed, {status.missing} missing"
+    _write(path, sections, title=title, heading=title, about=about)
 
 
 def _parameters(summary: FleetSummary) -> Table:

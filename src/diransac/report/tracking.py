@@ -42,8 +42,7 @@ def write_tracking_report(history: History, path: str | Path, *, command: str = 
     write_page(
         path,
         "tracking.html",
-        ["page.css"],
-        "page.js",
+        script="page.js",
         title=f"{model.name}, tracked",
         heading=model.name,
         about=model.description,

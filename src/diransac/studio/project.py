@@ -32,8 +32,6 @@ _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
     *("with-suggestions", "add-terms", "time-limit", "differentiate", "bandwidth"),
 ]
-_LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies", "add-terms"}
-"""Options whose value is one text with commas."""
 
 
 def _hyphened(name: str) -> str:
@@ -227,7 +225,7 @@ def _texts(key: str, value: Any) -> list[str]:
     """Values of an option on the command line."""
     if key == "leave-out":
         return [",".join(f"{a:.12g}:{b:.12g}" for a, b in value)] if value else []
-    if key in _LISTED:
+    if isinstance(value, list):
         return [",".join(value)]
     if isinstance(value, dict):
         pairs = [_pair(key, name, x) for name, x in value.items()]

@@ -12,8 +12,8 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import is_result, model_file, numbers, pairs
+from diransac.cli.commands import grouped
 from diransac.cli.flight_options import FlightPicture, LogOutput
-from diransac.cli.group import grouped
 from diransac.cli.options import JsonFlag
 from diransac.cli.outputs import staged
 from diransac.cli.robot_options import RobotOptions, UnsaturatedRobot

@@ -12,6 +12,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import load_model, model_file
+from diransac.cli.commands import grouped
 from diransac.cli.flight_options import (
     FlightPicture,
     FlightSeed,
@@ -23,7 +24,6 @@ from diransac.cli.flight_options import (
     TrajectoryOption,
     same_equations,
 )
-from diransac.cli.group import grouped
 from diransac.cli.options import JsonFlag, ModelName, ResultFile
 from diransac.cli.outputs import staged
 from diransac.data.log import Log

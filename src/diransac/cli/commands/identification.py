@@ -13,7 +13,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import model_file, names, preparation_of, start_values
-from diransac.cli.group import grouped
+from diransac.cli.commands import grouped
 from diransac.cli.options import (
     Derivation,
     JsonFlag,

@@ -10,7 +10,7 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import fixed_parameters, model_file, preparation_of
-from diransac.cli.group import grouped
+from diransac.cli.commands import grouped
 from diransac.cli.options import (
     FixedParameters,
     JsonFlag,

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import fixed_parameters, model_file, preparation_of, start_values
+from diransac.cli.arguments import fixed_parameters, is_result, model_file, preparation_of, start_values
+from diransac.cli.commands import grouped
 from diransac.cli.flight_options import FlightPicture
-from diransac.cli.group import grouped
 from diransac.cli.options import (
     FixedParameters,
     JsonFlag,
@@ -79,12 +79,12 @@ class TrackerOptions:
 
     def start_file(self) -> Path | None:
         """The result that is the start, where one is named."""
-        return Path(self.rough) if self.rough is not None and self.rough.endswith(".json") else None
+        return Path(self.rough) if self.rough is not None and is_result(self.rough) else None
 
     def start(self, model: str) -> Result | dict[str, float] | None:
         """Start of the tracker."""
         file = self.start_file()
-        if file is None and self.rough is None and model.endswith(".json"):
+        if file is None and self.rough is None and is_result(model):
             file = Path(model)
         return start_values("--start", self.rough) if file is None else Result.load(file)
 
