@@ -73,61 +73,37 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
         raise typer.BadParameter(f"{option}: {error}; give name=number pairs") from error
 
 
-def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | None]:
-    """``["mass=0.25,gravity"]`` as values by name; None for a name alone.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    texts : sequence of str
-        Items, separated by commas.
+def fixed_parameters(texts: Sequence[str] | None) -> dict[str, float | None]:
+    """``["mass=0.25,gravity"]`` of ``--fix`` as values by name; None for a name alone.
 
     Raises
     ------
     typer.BadParameter
         As `numbers`.
     """
-    items = [item for text in texts for item in names(text)]
+    items = [item for text in texts or () for item in names(text)]
     alone = [item for item in items if "=" not in item]
-    found: dict[str, float | None] = {**numbers(option, [item for item in items if "=" in item])}
+    found: dict[str, float | None] = {**numbers("--fix", [item for item in items if "=" in item])}
     for name in alone:
         if name in found:
-            raise typer.BadParameter(f"{option}: {name} is given twice")
+            raise typer.BadParameter(f"--fix: {name} is given twice")
         found[name] = None
     return found
 
 
-def start_values(option: str, text: str | None) -> dict[str, float] | None:
-    """``"mass=0.3,drag=0.02"`` as values by name; None without a text.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    text : str or None
+def start_values(text: str | None) -> dict[str, float] | None:
+    """``"mass=0.3,drag=0.02"`` of ``--start`` as values by name; None without a text.
 
     Raises
     ------
     typer.BadParameter
         As `numbers`.
     """
-    return None if text is None else numbers(option, names(text))
+    return None if text is None else numbers("--start", names(text))
 
 
-def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """``["inertia=0.004,0.001"]`` as a mean and a standard deviation by name.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    texts : sequence of str
-        A prior each.
-
-    Returns
-    -------
-    dict of str to (float, float)
+def prior_pairs(texts: Sequence[str] | None) -> dict[str, tuple[float, float]]:
+    """``["inertia=0.004,0.001"]`` of ``--prior`` as a mean and a standard deviation by name.
 
     Raises
     ------
@@ -135,14 +111,14 @@ def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, flo
         A text is not ``name=mean,deviation``, or a name is given twice.
     """
     found: dict[str, tuple[float, float]] = {}
-    for text in texts:
+    for text in texts or ():
         name, _, values = (part.strip() for part in text.partition("="))
         try:
             mean, std = (float(x) for x in values.split(","))
         except ValueError as error:
-            raise typer.BadParameter(f"{option}: {text!r} is not name=mean,standard deviation") from error
+            raise typer.BadParameter(f"--prior: {text!r} is not name=mean,standard deviation") from error
         if name in found:
-            raise typer.BadParameter(f"{option}: {name} is given twice")
+            raise typer.BadParameter(f"--prior: {name} is given twice")
         found[name] = (mean, std)
     return found
 

@@ -155,7 +155,7 @@ class Project(BaseModel):
         """Arguments of ``identify``, of files beside the project."""
         model = self.words_of_model(folder)
         chosen = ["--model", *model] if model else []
-        logs = [_hyphenless(str(folder / log)) for log in self.logs]
+        logs = [hyphenless(str(folder / log)) for log in self.logs]
         return [*logs, *chosen, *self.words_of_reading(folder), *self._words(_SEARCH, folder)]
 
     def _words(self, keys: Sequence[str], folder: Path) -> Iterator[str]:
@@ -168,7 +168,7 @@ class Project(BaseModel):
                     continue
                 for text in _texts(key, options[key]):
                     is_file = key == "mapping" and self.mapping_file
-                    placed = _hyphenless(str(folder / text)) if is_file else text
+                    placed = hyphenless(str(folder / text)) if is_file else text
                     yield from [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
 
     # ------------------------------------------------------------------ Python
@@ -248,7 +248,7 @@ def _placed(model: str, folder: Path) -> str:
     """A model beside the project as the command finds it, never a word that begins like an option."""
     file, name = file_and_name(model, "") or (Path(model), "")
     is_file = file.suffix or "/" in model
-    return _hyphenless(f"{folder / file}{name and ':'}{name}" if is_file else model)
+    return hyphenless(f"{folder / file}{name and ':'}{name}" if is_file else model)
 
 
 def _is_name(text: str) -> bool:
@@ -256,7 +256,8 @@ def _is_name(text: str) -> bool:
     return text.isidentifier() and not keyword.iskeyword(text)
 
 
-def _hyphenless(text: str) -> str:
+def hyphenless(text: str) -> str:
+    """Name of a file that no command takes for an option."""
     return f"./{text}" if text.startswith("-") else text
 
 

@@ -86,7 +86,7 @@ def _identify(
     """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
     (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
     terms = names(add_terms or "") or with_suggestions
-    aims = {"start": start_values("--start", rough), "horizon": horizon, "with_suggestions": terms}
+    aims = {"start": start_values(rough), "horizon": horizon, "with_suggestions": terms}
     read = [*files, model_file(model), search.settings]
     if each.asked():
         if output or strict:

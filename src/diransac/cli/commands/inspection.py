@@ -52,7 +52,7 @@ def _inspect(
     like = preparation_of(model)
     topics = next(filter(None, map(read_topics, files)), None)
     if topics is None or preparation.names_signals or any(step["step"] == "map" for step in like):
-        known = fixed_parameters("--fix", fixed or ())
+        known = fixed_parameters(fixed)
         logs = [preparation.read_uneven(file, like) for file in files]
         screen.show(inspect(logs, plant, fixed=known), as_json)
     else:

@@ -63,7 +63,7 @@ class TrackerOptions:
 
     def model_of(self, whole: Model, start: Result | dict[str, float] | None) -> Model:
         """The model without the parameters that are known, by option or in the result with which it starts."""
-        known = KnownParameters.of(whole, fixed_parameters("--fix", self.fixed or ()), None).fixed
+        known = KnownParameters.of(whole, fixed_parameters(self.fixed), None).fixed
         of_start = {n: start.parameters[n] for n in start.fixed} if isinstance(start, Result) else {}
         return whole.with_fixed({**of_start, **known})
 
@@ -86,7 +86,7 @@ class TrackerOptions:
         file = self.start_file()
         if file is None and self.rough is None and is_result(model):
             file = Path(model)
-        return start_values("--start", self.rough) if file is None else Result.load(file)
+        return start_values(self.rough) if file is None else Result.load(file)
 
 
 @app.command("track")
