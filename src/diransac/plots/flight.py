@@ -112,13 +112,13 @@ def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
 
 @dataclass(frozen=True)
 class FlightCurve:
-    """One flight, its reference, colour and dashes."""
+    """One flight, its reference, colour and style of line."""
 
     label: str
     reference: Trajectory
     log: Log
     colour: str
-    dashes: tuple[float, ...]
+    dashes: Any
 
 
 def _flights(trajectory: Trajectory | Mapping[str, Trajectory], log: Log | Mapping[str, Log]) -> list[FlightCurve]:
@@ -240,8 +240,7 @@ _LIMIT_STYLE: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (
 
 def _style(flight: FlightCurve) -> dict[str, Any]:
     """Style of a flight's line."""
-    style: Any = (0.0, flight.dashes) if flight.dashes else "-"
-    return {"color": flight.colour, "linewidth": 1.25, "linestyle": style}
+    return {"color": flight.colour, "linewidth": 1.25, "linestyle": flight.dashes}
 
 
 def _reference_style(flights: Sequence[FlightCurve]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from diransac.data.log import Log
 from diransac.identification.assessment.horizons import HorizonScores
 from diransac.identification.assessment.innovations import Innovations
 from diransac.identification.assessment.validation import Validation
+from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.evaluation.findings import bounds_text
 from diransac.identification.finding import Finding, Level, Verdict, next_line, shown, verdict_of
 from diransac.report.figures import Scale, Tick, padded, ticks
@@ -281,7 +282,8 @@ def _at(value: float, scale: Scale) -> str:
 
 def diagnosis(entries: Sequence[Entry]) -> list[tuple[Table, str]]:
     """Noise, outliers and unmodelled acceleration of each signal, and the input delay, by each result that has them."""
-    return [(_signal_table(e, len(entries) > 1), _delay(e)) for e in entries if e.result.diagnosis is not None]
+    having = [(entry, entry.result.diagnosis) for entry in entries if entry.result.diagnosis is not None]
+    return [(_signal_table(entry, found, len(entries) > 1), _delay(entry, found)) for entry, found in having]
 
 
 def suggestions(entries: Sequence[Entry]) -> list[Table]:
@@ -313,10 +315,8 @@ def _by(entry: Entry, entries: Sequence[Entry]) -> str:
     return f", by {entry.label}" if len(entries) > 1 else ""
 
 
-def _signal_table(entry: Entry, several: bool) -> Table:
-    found, units = entry.result.diagnosis, entry.result.model.units
-    assert found is not None
-    rows = []
+def _signal_table(entry: Entry, found: Diagnosis, several: bool) -> Table:
+    rows, units = [], entry.result.model.units
     for name in dict.fromkeys((*found.noise_std, *found.unmodelled_accelerations)):
         measured = name in found.noise_std
         noise = number(found.noise_std[name], 2) if measured else "not measured"
@@ -330,9 +330,7 @@ def _signal_table(entry: Entry, several: bool) -> Table:
     return Table(("Signal", "Unit", "Noise", "Outliers", "Unmodelled"), rows, caption)
 
 
-def _delay(entry: Entry) -> str:
-    found = entry.result.diagnosis
-    assert found is not None
+def _delay(entry: Entry, found: Diagnosis) -> str:
     if not found.input_delay_significant:
         return ""
     delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)

@@ -84,14 +84,14 @@ def _identify(
     strict: StrictFlag = False,
 ) -> None:
     """Identify the parameters of a model from one log, from several logs of one machine, or from each by itself."""
-    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
+    (chosen,) = search.methods([method])
     terms = names(add_terms or "") or with_suggestions
-    aims = {"start": start_values(rough), "horizon": horizon, "with_suggestions": terms}
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
+    arguments |= {"start": start_values(rough), "horizon": horizon, "with_suggestions": terms}
     read = [*files, model_file(model), search.settings]
     if each.asked():
         if output or strict:
             raise typer.BadParameter("--each keeps its results in --store; -o and --strict are of one result")
-        arguments = search.arguments() | derived | aims
         each.run(
             files,
             robot.load(model),
@@ -116,8 +116,7 @@ def _identify(
         for k, (limb, plant) in enumerate(limbs.items()):
             saved, page = drafts[2 * k : 2 * k + 2]
             with screen.bar(f"{method} {limb}".rstrip()) as progress:
-                arguments = search.arguments() | derived | aims | {"time_limit": search.time_limit}
-                found = identify(plant, logs, chosen, progress=progress, **arguments)
+                found = identify(plant, logs, chosen, progress=progress, time_limit=search.time_limit, **arguments)
             results[limb] = found
             if output:
                 found.save(saved)
@@ -175,11 +174,12 @@ def _cross_validate(
     """Identify from all logs but one, and predict that one, for each in turn."""
     from diransac.identification.assessment.cross_validation import cross_validate
 
-    (chosen,), derived = search.methods([method]), preparation.completed(derivation).arguments()
+    (chosen,) = search.methods([method])
+    arguments = search.arguments() | preparation.completed(derivation).arguments()
+    arguments |= {"horizon": horizon, "time_limit": search.time_limit}
     plant, logs = robot.load(model), preparation.read_all(files, preparation_of(model))
-    arguments = search.arguments() | derived | {"time_limit": search.time_limit}
     with screen.bar(f"{method}, leaving one log out") as progress:
-        found = cross_validate(plant, logs, chosen, horizon=horizon, progress=progress, **arguments)
+        found = cross_validate(plant, logs, chosen, progress=progress, **arguments)
     screen.show(found, as_json)
 
 
