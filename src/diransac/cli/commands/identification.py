@@ -113,8 +113,7 @@ def _identify(
     outputs = [_of_limb(path, limb) for limb in limbs for path in (output, report)]
     with staged(outputs, read) as drafts:
         logs = preparation.read_all(files, preparation_of(model))
-        for k, (limb, plant) in enumerate(limbs.items()):
-            saved, page = drafts[2 * k : 2 * k + 2]
+        for (limb, plant), saved, page in zip(limbs.items(), drafts[::2], drafts[1::2], strict=True):
             with screen.bar(f"{method} {limb}".rstrip()) as progress:
                 found = identify(plant, logs, chosen, progress=progress, time_limit=search.time_limit, **arguments)
             results[limb] = found
