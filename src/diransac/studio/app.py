@@ -323,17 +323,8 @@ async def _result(studio: Studio, request: Request) -> Response:
         raise LogError("there is no such result")
     result = await run_in_threadpool(Result.load, studio.folders.find(name))
     rows = [] if result.competition is None else result.competition.lines()
-    keys = (
-        "parameters",
-        "units",
-        "fixed",
-        "intervals_95",
-        "structural_intervals_95",
-        "verdict",
-        "findings",
-        "suggestions",
-    )
-    shown = {key: value for key, value in result.to_dict().items() if key in keys}
+    keys = ("parameters", "units", "fixed", "verdict", "findings", "suggestions")
+    shown = {key: value for key, value in result.to_dict().items() if key in keys or key.endswith("intervals_95")}
     structural = result.structural_intervals() if result.has_structure else {}
     for key, intervals in (("intervals_text", result.intervals()), ("structural_text", structural)):
         shown[key] = {name: interval_text(*ends) for name, ends in intervals.items()}
