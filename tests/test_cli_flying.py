@@ -365,7 +365,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("diransac.cli.flight_runs.fly", interrupt)
+    monkeypatch.setattr("diransac.cli.commands.flight.fly", interrupt)
     before = contents(folder)
     done = run(*words)
     assert (done.exit_code, done.stderr) == (130, "interrupted\n")
@@ -383,7 +383,7 @@ def test_interrupt_ends_with_130_and_writes_nothing(
 def test_outputs_are_checked_before_the_work(
     result: dr.Result, folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
 ):
-    monkeypatch.setattr("diransac.cli.flight_runs.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
+    monkeypatch.setattr("diransac.cli.commands.flight.tvlqr", lambda *_, **__: pytest.fail("the work has begun"))
     Path("folder.csv").mkdir()
     Path("link.png").symlink_to("model.json")
     before = contents(folder)

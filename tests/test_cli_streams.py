@@ -51,10 +51,10 @@ def test_quiet_shows_no_progress_of_rows(capsys: pytest.CaptureFixture[str], mon
     monkeypatch.setenv("FORCE_COLOR", "1")  # a bar, from the first row on
     try:
         for level, shown in ((-1, False), (0, True)):
-            screen.set_verbosity(level)
+            screen.begin(verbosity=level)
             with running("3 logs", Path("fleet.db"), 1, None) as how:
                 how["progress"](1, 3)
                 how["progress"](3, 3)
             assert bool(capsys.readouterr().err) is shown
     finally:
-        screen.set_verbosity(0)
+        screen.begin()

@@ -11,7 +11,7 @@ import pytest
 
 import diransac as dr
 from command_line import MODEL, QUICK, run, working_folder
-from diransac.cli.group import _MODULES
+from diransac.cli.commands import _MODULES
 from diransac.data.files import place_of_metadata
 from studies import TINY_TOML
 

@@ -161,7 +161,7 @@ def test_what_is_missing_is_said_below_the_picture(store: Path):
 
 def test_an_axis_holds_all_that_is_beyond_it_in_order():
     values = np.array([0.0, 1e-9, 0.01, 3.0, 9e3, 1e12, np.inf])
-    scale = LogAxis.of([MarkRow("a", values[:-1], values[1:])], -3)
+    scale = LogAxis.of([MarkRow("a", values[:-1], values[1:])])
     places = scale.place(values)
     assert places[2:5] == pytest.approx(np.log10([0.01, 3.0, 9e3]))
     assert places[0] == places[1]
@@ -174,7 +174,7 @@ def test_an_axis_holds_all_that_is_beyond_it_in_order():
 
 @pytest.mark.parametrize("width", [2.0, 9.0])
 def test_names_along_an_axis_do_not_touch(width: float):
-    scale = LogAxis.of([MarkRow("a", np.array([0.002, 50.0]), np.array([np.inf, 1e9]))], -3)
+    scale = LogAxis.of([MarkRow("a", np.array([0.002, 50.0]), np.array([np.inf, 1e9]))])
     at = np.sort(list(scale.names(width)))
     assert len(at) > 4
     assert np.diff(at).min() * width / (scale.ends[1] - scale.ends[0]) > 0.3

@@ -129,7 +129,7 @@ def test_progress_prints_no_control_characters_and_no_markup(capsys, monkeypatch
     monkeypatch.setenv("FORCE_COLOR", "1" if how in ("bar", "rows") else "")
     monkeypatch.setenv("COLUMNS", "400")
     text = HARMFUL + TEXTS["markup"]
-    screen.set_verbosity(1 if how == "stages" else 0)
+    screen.begin(verbosity=1 if how == "stages" else 0)
     try:
         if how.startswith("rows"):
             with workers.running(text, Path(text), None, None) as arguments:
@@ -139,7 +139,7 @@ def test_progress_prints_no_control_characters_and_no_markup(capsys, monkeypatch
             with screen.bar(text) as show:
                 show(Progress(text, 0.5, text))
     finally:
-        screen.set_verbosity(0)
+        screen.begin()
     shown = OURS.sub("", capsys.readouterr().err)
     assert is_plain(shown)
     assert printable(text.split("\n")[0])[:20] in shown

@@ -1,10 +1,11 @@
-"""Text, JSON and TOML of files from anyone: bounded in size, depth and digits."""
+"""Text, JSON and TOML of files from anyone, bounded in size, depth and digits; and JSON for programs."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -50,6 +51,19 @@ def json_data(text: str | bytes) -> Any:
         if re.search(r"\\u[dD][89a-fA-F]", text if isinstance(text, str) else text.decode("latin-1")):
             _check_encodable(found)
         return found
+
+
+def json_text(data: object, indent: int | None = None) -> str:
+    """Data as JSON, on one line without an indent; numbers that are not finite are null."""
+    return json.dumps(_finite(data), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(data: object) -> object:
+    if isinstance(data, float):
+        return data if math.isfinite(data) else None
+    if isinstance(data, Mapping):
+        return {str(key): _finite(value) for key, value in data.items()}
+    return [_finite(value) for value in data] if isinstance(data, list | tuple) else data
 
 
 def _check_depth(found: object) -> None:

@@ -1,4 +1,4 @@
-"""Definitions in users' Python files, with the output of their code kept off the terminal.
+"""Models by file, and definitions in users' Python files, with the output of their code kept off the terminal.
 
 Stdout is for results and stderr for a few lines; text that a user's own code prints goes to neither.
 """
@@ -36,6 +36,11 @@ def file_and_name(text: str, default: str) -> tuple[Path, str] | None:
     """File and name of ``file.py[:name]``, with ``default`` for an absent name; None for text of another form."""
     match = re.fullmatch(r"([^\0\n]+\.py)(?::(\w+))?", text)
     return None if match is None else (Path(match[1]), match[2] or default)
+
+
+def is_description(text: str) -> bool:
+    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
+    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
 
 
 def definitions(file: Path, what: str) -> Mapping[str, object]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from diransac.identification.methods import WITH_ESTIMATOR, configured, estimato
 from diransac.identification.settings import Settings, nearest_names
 from diransac.model import Model
 from diransac.plain_data import toml_file, toml_table
-from diransac.user_files import definitions, file_and_name
+from diransac.user_files import definitions, file_and_name, is_description
 
 # ---------------------------------------------------------------------- lists of pairs
 
@@ -73,61 +73,37 @@ def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
         raise typer.BadParameter(f"{option}: {error}; give name=number pairs") from error
 
 
-def fixed_parameters(option: str, texts: Sequence[str]) -> dict[str, float | None]:
-    """``["mass=0.25,gravity"]`` as values by name; None for a name alone.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    texts : sequence of str
-        Items, separated by commas.
+def fixed_parameters(texts: Sequence[str] | None) -> dict[str, float | None]:
+    """``["mass=0.25,gravity"]`` of ``--fix`` as values by name; None for a name alone.
 
     Raises
     ------
     typer.BadParameter
         As `numbers`.
     """
-    items = [item for text in texts for item in names(text)]
+    items = [item for text in texts or () for item in names(text)]
     alone = [item for item in items if "=" not in item]
-    found: dict[str, float | None] = {**numbers(option, [item for item in items if "=" in item])}
+    found: dict[str, float | None] = {**numbers("--fix", [item for item in items if "=" in item])}
     for name in alone:
         if name in found:
-            raise typer.BadParameter(f"{option}: {name} is given twice")
+            raise typer.BadParameter(f"--fix: {name} is given twice")
         found[name] = None
     return found
 
 
-def start_values(option: str, text: str | None) -> dict[str, float] | None:
-    """``"mass=0.3,drag=0.02"`` as values by name; None without a text.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    text : str or None
+def start_values(text: str | None) -> dict[str, float] | None:
+    """``"mass=0.3,drag=0.02"`` of ``--start`` as values by name; None without a text.
 
     Raises
     ------
     typer.BadParameter
         As `numbers`.
     """
-    return None if text is None else numbers(option, names(text))
+    return None if text is None else numbers("--start", names(text))
 
 
-def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """``["inertia=0.004,0.001"]`` as a mean and a standard deviation by name.
-
-    Parameters
-    ----------
-    option : str
-        Name of the option in messages.
-    texts : sequence of str
-        A prior each.
-
-    Returns
-    -------
-    dict of str to (float, float)
+def prior_pairs(texts: Sequence[str] | None) -> dict[str, tuple[float, float]]:
+    """``["inertia=0.004,0.001"]`` of ``--prior`` as a mean and a standard deviation by name.
 
     Raises
     ------
@@ -135,14 +111,14 @@ def prior_pairs(option: str, texts: Sequence[str]) -> dict[str, tuple[float, flo
         A text is not ``name=mean,deviation``, or a name is given twice.
     """
     found: dict[str, tuple[float, float]] = {}
-    for text in texts:
+    for text in texts or ():
         name, _, values = (part.strip() for part in text.partition("="))
         try:
             mean, std = (float(x) for x in values.split(","))
         except ValueError as error:
-            raise typer.BadParameter(f"{option}: {text!r} is not name=mean,standard deviation") from error
+            raise typer.BadParameter(f"--prior: {text!r} is not name=mean,standard deviation") from error
         if name in found:
-            raise typer.BadParameter(f"{option}: {name} is given twice")
+            raise typer.BadParameter(f"--prior: {name} is given twice")
         found[name] = (mean, std)
     return found
 
@@ -171,13 +147,31 @@ def load_settings(file: Path | None, assignments: Sequence[str]) -> dict[str, An
         if file is None
         else {key.replace("-", "_"): value for key, value in toml_file(file, "settings file").items()}
     )
-    for text in assignments:
-        key, equals, value = text.partition("=")
-        keys = [part.strip() for part in key.split(".")]
-        if not equals or not all(keys):
-            raise typer.BadParameter(f"--set: {text!r} is not key=value")
-        _assign(table, [keys[0].replace("-", "_"), *keys[1:]], toml_value(value.strip()))
+    for (first, *inner), value in assigned(assignments, "sample_size=50"):
+        _assign(table, [first.replace("-", "_"), *inner], value)
     return {key: _none_where_meant(key, value) for key, value in table.items()}
+
+
+def assigned(assignments: Sequence[str], example: str) -> Iterator[tuple[list[str], object]]:
+    """Keys ``a, b`` and value of each ``a.b=value`` of ``--set``.
+
+    Parameters
+    ----------
+    assignments : sequence of str
+    example : str
+        An assignment, for the message.
+
+    Raises
+    ------
+    typer.BadParameter
+        An assignment has another form.
+    """
+    for text in assignments:
+        path, equals, value = text.partition("=")
+        keys = [part.strip() for part in path.split(".")]
+        if not equals or not all(keys):
+            raise typer.BadParameter(f"--set: {text!r} is not key=value, such as {example}")
+        yield keys, _toml_value(value.strip())
 
 
 def load_methods(names: Sequence[str], settings: Mapping[str, Any], estimator: str | None = None) -> list[Method]:
@@ -225,7 +219,7 @@ def _assign(table: dict[str, Any], keys: Sequence[str], value: object) -> None:
     table[last] = value
 
 
-def toml_value(text: str) -> object:
+def _toml_value(text: str) -> object:
     """A TOML value; a bare word is itself."""
     for candidate in (text, text.lower(), f"[{text}]" if "," in text else text):
         try:
@@ -247,12 +241,7 @@ def _none_where_meant(key: str, value: object) -> object:
 # ---------------------------------------------------------------------- models
 
 
-def is_description(text: str) -> bool:
-    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
-    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
-
-
-def _is_result(text: str) -> bool:
+def is_result(text: str) -> bool:
     """True for the name of a result, ``.json``."""
     return Path(text).suffix.lower() == ".json"
 
@@ -273,7 +262,7 @@ def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
     ResultError
         The result cannot be loaded.
     """
-    if model is None or not _is_result(model):
+    if model is None or not is_result(model):
         return ()
     from diransac.identification.result import Result
 
@@ -282,7 +271,7 @@ def preparation_of(model: str | None) -> Sequence[Mapping[str, Any]]:
 
 def model_file(text: str) -> Path | None:
     """The file of ``file.py[:name]``, of a robot's description or of a result; None for a built-in model's name."""
-    if is_description(text) or _is_result(text):
+    if is_description(text) or is_result(text):
         return Path(text)
     found = file_and_name(text, "model")
     return None if found is None else found[0]
@@ -298,7 +287,7 @@ def load_model(text: str) -> Model:
     ResultError
         The result cannot be loaded.
     """
-    if _is_result(text):
+    if is_result(text):
         from diransac.identification.result import Result
 
         return Result.load(text).model

@@ -22,7 +22,6 @@ from diransac.model.plant import Plant, check_possible
 T = TypeVar("T")
 
 Shape: TypeAlias = Literal["star", "square", "sine"]
-EXTENDED = "extended-rotorcraft"
 
 
 def _finite(number: float | None) -> float | None:
@@ -155,7 +154,7 @@ class PlantOptions:
         given = numbers("--parameter", disturbances.pop("assignments", ()))
         if disturbances.pop("plant", None) is None:
             for option in disturbances:
-                raise typer.BadParameter(f"--{option.replace('_', '-')} needs --plant {EXTENDED}; give both")
+                raise typer.BadParameter(f"--{option.replace('_', '-')} needs --plant extended-rotorcraft; give both")
             return Plant(model, _true_parameters(model, given))
         parameters = _true_parameters(planar_rotorcraft(), given)
         if disturbances.get("rotor_phase") == "any":

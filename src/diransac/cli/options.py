@@ -201,11 +201,12 @@ class Search:
 
         Raises typer.BadParameter: they cannot be read.
         """
-        known = {
-            "fixed": fixed_parameters("--fix", self.fixed or ()),
-            "priors": prior_pairs("--prior", self.priors or ()),
+        return {
+            "seed": self.seed,
+            "input_hold": self.input_hold,
+            "fixed": fixed_parameters(self.fixed),
+            "priors": prior_pairs(self.priors),
         }
-        return {"seed": self.seed, "input_hold": self.input_hold, **known}
 
     def methods(self, names: Sequence[str]) -> list[Method]:
         """The methods with these settings.  Raises SettingsError: a setting has no meaning."""

@@ -15,9 +15,8 @@ from diransac.errors import DiransacError, ResultError
 
 STDOUT = Path("-")
 """Name of stdout among outputs, and of stdin among logs."""
-RESULT = (".json",)
 PAGE = (".html", ".htm")
-"""Endings of results and of pages."""
+"""Endings of pages."""
 
 
 def checked(outputs: Sequence[Path | None], inputs: Sequence[Path | None] = ()) -> list[Path | None]:

@@ -1,20 +1,18 @@
-"""Options for models from descriptions of robots, and the results of their limbs."""
+"""Options for models from descriptions of robots."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from diransac.cli.arguments import is_description, load_model, names, pairs
-from diransac.identification.result import Result
+from diransac.cli.arguments import load_model, names, pairs
 from diransac.model import Model
 from diransac.model.parts import independent_parts
-from diransac.text_table import aligned, telling_digits
+from diransac.user_files import is_description
 
 if TYPE_CHECKING:
     from diransac.model.robots import Actuation, MotorCurrents, PositionControl
@@ -183,44 +181,3 @@ def _made(kind: type[Drives], option: str, text: str) -> Drives:
         raise typer.BadParameter(
             f"{option}: {error}; give {', '.join(sorted(_NUMBERS & set(known)))} as numbers"
         ) from error
-
-
-def of_limb(path: Path | None, limb: str) -> Path | None:
-    """File of a limb, ``model-FL.json`` beside ``model.json``; the file itself for a model that is in one part."""
-    return path if path is None or not limb else path.with_stem(f"{path.stem}-{limb}")
-
-
-@dataclass(frozen=True)
-class LimbResults:
-    """Results of the limbs of a robot, side by side.
-
-    Parameters
-    ----------
-    results : mapping of str to Result
-        By the name of the limb.
-    """
-
-    results: Mapping[str, Result]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Results by limb."""
-        return {"limbs": {limb: result.to_dict() for limb, result in self.results.items()}}
-
-    def __str__(self) -> str:
-        rows: list[Sequence[str]] = [("parameter ± 95 %", *self.results, "unit")]
-        of_limbs = [_without_limb(limb, result) for limb, result in self.results.items()]
-        for name in dict.fromkeys(name for own in of_limbs for name in own):
-            units = [own[name][1] for own in of_limbs if name in own]
-            rows.append((name, *(own[name][0] if name in own else "" for own in of_limbs), units[0]))
-        texts = (f"{limb}: {result}" for limb, result in self.results.items())
-        return "\n".join([*aligned(rows), "", *texts])
-
-
-def _without_limb(limb: str, result: Result) -> dict[str, tuple[str, str]]:
-    """Estimate with half of its interval, and unit, of each parameter, by its name without that of the limb."""
-    found = {}
-    for name, (low, high) in result.intervals().items():
-        value, digits = result.parameters[name], telling_digits(low, high)
-        text = "?" if name in result.unidentifiable else f"{value:.{digits}g} ± {0.5 * (high - low):.2g}"
-        found[name.replace(f"_{limb}_", "_")] = text, result.units[name]
-    return found

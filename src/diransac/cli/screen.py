@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import shlex
 import sys
@@ -11,26 +9,46 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Protocol, TextIO
 
 import typer
 
 from diransac.identification.method import Callback, Progress
+from diransac.plain_data import json_text
 from diransac.plain_text import one_line, printable
 from diransac.time_limit import end_search
 
-_STATE = {"verbosity": 0, "taken": 0, "for_programs": 0}
-"""Of the command that this process runs: -1 quiet, 1 verbose; number of outputs that are written to stdout; 1 where
-progress is for programs.
-"""
-_WORDS: list[str] = []
-"""Of the same command."""
+_FIRST_LINE = 5.0
+"""Seconds until the first line of progress without a terminal."""
 
-UNRELIABLE = 3
-"""Exit code of `end`."""
 
-_FIRST_LINE, _LINE_EVERY = 5.0, 10.0
-"""Seconds until the first line of progress without a terminal, and between lines."""
+@dataclass
+class _State:
+    """Of the command that this process runs: its words, and what `begin` sets; the outputs that are on stdout."""
+
+    words: Sequence[str] = ()
+    verbosity: int = 0
+    for_programs: bool = False
+    taken: int = 0
+
+
+_STATE = _State()
+
+
+def begin(words: Sequence[str] = (), verbosity: int = 0, *, for_programs: bool = False) -> None:
+    """Set what is printed of a command, and how much.
+
+    Parameters
+    ----------
+    words : sequence of str
+        After the program's name.
+    verbosity : int
+        -1: results that are asked for as JSON, and errors; 0: results and progress; 1: a line for every stage.
+    for_programs : bool
+        Whether progress is written as JSON lines on stderr, and a line ``stop`` on stdin ends a search.
+    """
+    _STATE.words, _STATE.verbosity, _STATE.for_programs = words, verbosity, for_programs
 
 
 class Showable(Protocol):
@@ -54,9 +72,9 @@ def show(shown: Showable, as_json: bool) -> None:
     if not as_json:
         say(*str(shown).split("\n"))
         return
-    if _STATE["taken"]:
+    if _STATE.taken:
         raise typer.BadParameter("-o - and --json both write to stdout; give one")
-    typer.echo(printable(json.dumps(_finite(shown.to_dict()), indent=1, ensure_ascii=False, allow_nan=False)))
+    typer.echo(printable(json_text(shown.to_dict(), indent=1)))
 
 
 def emit(data: Mapping[str, Any]) -> None:
@@ -66,7 +84,7 @@ def emit(data: Mapping[str, Any]) -> None:
     ----------
     data : mapping
     """
-    typer.echo(printable(json.dumps(_finite(data), ensure_ascii=False, allow_nan=False)))
+    typer.echo(printable(json_text(data)))
     sys.stdout.flush()
 
 
@@ -79,7 +97,7 @@ def say(*lines: str) -> None:
         A line break within one is no other line.
     """
     if not is_quiet():
-        typer.echo(printable("\n".join(map(one_line, lines))), err=bool(_STATE["taken"]))
+        typer.echo(printable("\n".join(map(one_line, lines))), err=bool(_STATE.taken))
 
 
 def note(*lines: str) -> None:
@@ -114,56 +132,24 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty()
 
 
-def set_command(words: Sequence[str]) -> None:
-    """Keep the command for `command`.
-
-    Parameters
-    ----------
-    words : sequence of str
-        After the program's name.
-    """
-    _WORDS[:] = words
-
-
 def command() -> str:
     """The command that this process runs, as a shell takes it."""
-    return shlex.join(["diransac", *_WORDS])
-
-
-def set_verbosity(level: int) -> None:
-    """Set how much is printed.
-
-    Parameters
-    ----------
-    level : int
-        -1: results that are asked for as JSON, and errors; 0: results and progress; 1: a line for every stage.
-    """
-    _STATE["verbosity"] = level
-
-
-def set_for_programs(is_so: bool) -> None:
-    """Set whether progress is written as JSON lines on stderr, and a line ``stop`` on stdin ends a search.
-
-    Parameters
-    ----------
-    is_so : bool
-    """
-    _STATE["for_programs"] = int(is_so)
+    return shlex.join(["diransac", *_STATE.words])
 
 
 def is_quiet() -> bool:
     """True if there is no progress and no text."""
-    return _STATE["verbosity"] < 0
+    return _STATE.verbosity < 0
 
 
 @contextmanager
 def stdout_taken() -> Iterator[None]:
     """Context in which an output is written to stdout, and all text goes to stderr."""
-    _STATE["taken"] += 1
+    _STATE.taken += 1
     try:
         yield
     finally:
-        _STATE["taken"] -= 1
+        _STATE.taken -= 1
 
 
 def end(verdict: str, strict: bool) -> None:
@@ -177,17 +163,7 @@ def end(verdict: str, strict: bool) -> None:
         Whether a verdict has an exit code of its own.
     """
     if strict and verdict == "do not rely on this":
-        raise typer.Exit(UNRELIABLE)
-
-
-def _finite(data: object) -> object:
-    if isinstance(data, float) and not math.isfinite(data):
-        return None
-    if isinstance(data, Mapping):
-        return {str(key): _finite(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_finite(value) for value in data]
-    return data
+        raise typer.Exit(3)
 
 
 @contextmanager
@@ -204,14 +180,14 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
-    if _STATE["for_programs"]:
+    if _STATE.for_programs:
         threading.Thread(target=_heed_stop, daemon=True).start()
-        yield lambda found: note(json.dumps(_finite({"label": label, **vars(found)}), ensure_ascii=False))
+        yield lambda found: note(json_text({"label": label, **vars(found)}))
         return
     if is_quiet():
         yield lambda _: None
         return
-    if _STATE["verbosity"] > 0:
+    if _STATE.verbosity > 0:
         yield Stages(label).show
         return
     if not shows_bars():
@@ -338,6 +314,6 @@ class Lines:
         elapsed = time.monotonic() - self._begin
         if elapsed < self._next or sys.stderr is None:
             return
-        self._next = elapsed + _LINE_EVERY
+        self._next = elapsed + 10.0
         left = f", about {elapsed * (1.0 / fraction - 1.0):.0f} s left" if fraction > 0.0 else ""
         note(f"{self._label}: {stage}, {fraction:.0%} after {elapsed:.0f} s{left}")

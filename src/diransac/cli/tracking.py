@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
+import mmap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -194,18 +194,11 @@ def _fields(texts: Sequence[str]) -> str:
 
 
 def _remove_partial_line(path: Path) -> None:
-    """Cut a file off after its last line break."""
+    """Cut a file, which is not empty, off after its last line break."""
     with path.open("r+b") as file:
-        end = file.seek(0, os.SEEK_END)
-        while end:
-            start = max(0, end - 4096)
-            file.seek(start)
-            line_break = file.read(end - start).rfind(b"\n")
-            if line_break >= 0:
-                file.truncate(start + line_break + 1)
-                return
-            end = start
-        file.truncate(0)
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            end = content.rfind(b"\n") + 1
+        file.truncate(end)
 
 
 # ---------------------------------------------------------------------- texts

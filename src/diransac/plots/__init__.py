@@ -8,7 +8,7 @@ In come logs, or a store; out comes a figure, and a file that is the same byte f
 | `figure.py` | colours, panels, heading, files |
 | `flight.py` | `plot_flight`: path, states and inputs of flights; simulated signals beside measured ones |
 | `study.py`, `estimates.py`, `paths.py` | tracking errors and failures, parameter errors, and flown paths of a study |
-| `fleet.py` | parameters of a fleet |
+| `fleet.py`, `tracking.py` | parameters of a fleet, and of a machine over time |
 """
 
 from diransac.plots.flight import plot_flight

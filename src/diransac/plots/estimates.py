@@ -122,7 +122,7 @@ def _drawn(summary: Summary, title: str) -> Figure:
     methods, rows = methods_and_errors(summary)
     every = _as_marks(method_looks(summary.methods))
     looks = {label: every[label] for label in methods}
-    scale, heading = LogAxis.of(rows, LEAST), axis_label(summary)
+    scale, heading = LogAxis.of(rows), axis_label(summary)
     caption = [
         f"Marks are medians over {n_trials(summary)} of a level, lines end at the largest. Errors are relative to the "
         "pseudo-true parameters, the best of the",
@@ -173,21 +173,20 @@ class MarkRow:
 class LogAxis:
     """Logarithmic axis with places beyond its ends for values that are too small, too large or infinite."""
 
-    least: int
     low: int
     high: int
     exceeded: bool
     endless: bool
 
     @classmethod
-    def of(cls, rows: Sequence[MarkRow], least: int) -> LogAxis:
+    def of(cls, rows: Sequence[MarkRow]) -> LogAxis:
         """Axis for these rows."""
         values = np.array([[row.median, row.worst] for row in rows])
-        seen = values[np.isfinite(values) & (values >= 10.0**least)]
-        smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (10.0**least, 10.0**least)
+        seen = values[np.isfinite(values) & (values >= 10.0**LEAST)]
+        smallest, largest = (float(seen.min()), float(seen.max())) if len(seen) else (10.0**LEAST, 10.0**LEAST)
         low = int(np.floor(np.log10(smallest)))
         high = min(max(int(np.ceil(np.log10(largest))), low + 1), low + 6)
-        return cls(least, low, high, largest > 10.0**high, bool(np.isinf(values).any()))
+        return cls(low, high, largest > 10.0**high, bool(np.isinf(values).any()))
 
     @property
     def nothing(self) -> float:
@@ -221,7 +220,7 @@ class LogAxis:
         """Labels by place along a panel of this width, inches; labels do not overlap."""
         decade = width / (self.ends[1] - self.ends[0])
         name, step = (_decade, 1) if decade > 0.5 else (_power, 2)
-        beyond = {self.nothing: f"<{name(self.least)}"}
+        beyond = {self.nothing: f"<{name(LEAST)}"}
         beyond |= {self.most: f">{name(self.high)}"} if self.exceeded else {}
         beyond |= {self.none: "none"} if self.endless else {}
         decades = range(self.low + step - 1, self.high + 1, step)
@@ -281,7 +280,7 @@ def _shade(axes: Axes, rows: Sequence[MarkRow], scale: LogAxis) -> None:
         if band % 2:
             axes.axhspan(i, i + 1, color=SOFT, linewidth=0.0, zorder=0.5)
     axes.vlines(np.arange(scale.low, scale.high + 1), 0, len(rows), color=RULE, linewidth=0.7, zorder=1.0)
-    apart = [scale.none - 0.6 * _ROOM] * scale.endless + [scale.low - 0.4 * _ROOM] * (scale.least < scale.low)
+    apart = [scale.none - 0.6 * _ROOM] * scale.endless + [scale.low - 0.4 * _ROOM] * (scale.low > LEAST)
     if apart:
         axes.vlines(apart, 0, len(rows), color=MUTED, linewidth=0.7, linestyle=":", zorder=1.0)
 

@@ -26,8 +26,10 @@ Range = tuple[float, float]
 PAPER, INK, MUTED, RULE, SOFT = "#ffffff", "#1c2126", "#5a646e", "#d8dde2", "#f4f6f8"
 REFERENCE = "#a3adb6"
 COLOURS = ("#0072b2", "#00875f", "#a63a79", "#946a00", "#2e9bd6", "#4b4bb5")
-# On and off, in line widths.
-DASHES = ((), (5.3, 1.8), (1.8, 1.8), (5.3, 1.8, 1.2, 1.8), (8.2, 2.4), (3.5, 0.9))
+# Solid, and on and off from a start, in line widths.
+DASHES: tuple[Any, ...] = (
+    *("-", (0.0, (5.3, 1.8)), (0.0, (1.8, 1.8)), (0.0, (5.3, 1.8, 1.2, 1.8)), (0.0, (8.2, 2.4)), (0.0, (3.5, 0.9))),
+)
 
 
 def extent(visible: Range) -> float:

@@ -30,6 +30,7 @@ from diransac.plots.figure import (
     round_step,
     write,
 )
+from diransac.text_table import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,13 +112,13 @@ def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
 
 @dataclass(frozen=True)
 class FlightCurve:
-    """One flight, its reference, colour and dashes."""
+    """One flight, its reference, colour and style of line."""
 
     label: str
     reference: Trajectory
     log: Log
     colour: str
-    dashes: tuple[float, ...]
+    dashes: Any
 
 
 def _flights(trajectory: Trajectory | Mapping[str, Trajectory], log: Log | Mapping[str, Log]) -> list[FlightCurve]:
@@ -239,8 +240,7 @@ _LIMIT_STYLE: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (
 
 def _style(flight: FlightCurve) -> dict[str, Any]:
     """Style of a flight's line."""
-    style: Any = (0.0, flight.dashes) if flight.dashes else "-"
-    return {"color": flight.colour, "linewidth": 1.25, "linestyle": style}
+    return {"color": flight.colour, "linewidth": 1.25, "linestyle": flight.dashes}
 
 
 def _reference_style(flights: Sequence[FlightCurve]) -> dict[str, Any]:
@@ -277,7 +277,7 @@ def _draw_signal(axes: Axes, name: str, flights: Sequence[FlightCurve], **held: 
         for limit in limits:
             if visible[0] <= limit <= visible[1]:
                 axes.axhline(limit, **_LIMIT_STYLE, zorder=2.2)
-        unit = f"{unit}, limits {_number(limits[0])} to {_number(limits[1])}".removeprefix(", ")
+        unit = f"{unit}, limits {number(limits[0])} to {number(limits[1])}".removeprefix(", ")
     times = [time for flight in flights for time in (flight.reference.time, flight.log.time)]
     axes.set(xlim=(min(float(t[0]) for t in times), max(float(t[-1]) for t in times)), ylim=visible)
     axes.xaxis.set_major_formatter("{x:g} s")
@@ -302,10 +302,6 @@ def _mark(axes: Axes, x: float, y: float, marker: str, flight: FlightCurve) -> N
 
 def _unit(name: str, flights: Sequence[FlightCurve]) -> str:
     return next((flight.log.units[name] for flight in flights if name in flight.log.units), "")
-
-
-def _number(x: float) -> str:
-    return f"{x:.4g}".replace("-", "−")
 
 
 # The path ------------------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from diransac.plots.figure import (
 )
 from diransac.study.method_choice import TRUE
 from diransac.study.summary import Summary, TrackingErrors, summarise
-from diransac.text_table import superscript
+from diransac.text_table import number, superscript
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -204,7 +204,8 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: _tick(y)))
+    # 0.01, 5×10⁻⁵, 10⁶
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: number(y, 6).removeprefix("1×")))
     if not logarithmic:
         axes.set_ylim(-0.04 * top, 1.06 * top)
         return
@@ -214,13 +215,6 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_ylim(-0.35 * 10.0**first, 1.6 * top)
-
-
-def _tick(y: float) -> str:
-    """``0.01``, ``5×10⁻⁵``, ``10⁶``."""
-    mantissa, _, exponent = f"{y:.6g}".partition("e")
-    power = f"10{superscript(int(exponent))}" if exponent else ""
-    return mantissa.replace("-", "−") if not power else power if mantissa == "1" else f"{mantissa}×{power}"
 
 
 # Labels and styles ---------------------------------------------------------------------------------------------------
@@ -255,7 +249,7 @@ def axis_label(summary: Summary) -> str:
 def level_labels(summary: Summary) -> list[str]:
     """Labels of the levels for that axis."""
     positions, _ = _positions(summary)
-    return [f"{x:.6g}".replace("-", "−") for x in positions] if summary.is_numeric else list(summary.levels)
+    return [number(x, 6) for x in positions] if summary.is_numeric else list(summary.levels)
 
 
 def n_trials(summary: Summary) -> str:

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 INTERVAL = 1.96
 """Half the width of a 95 % interval, in standard errors."""
-_CHANGE: dict[str, Any] = {"color": COLOURS[2], "linewidth": 1.0, "linestyle": (0.0, DASHES[2])}
+_CHANGE: dict[str, Any] = {"color": COLOURS[2], "linewidth": 1.0, "linestyle": DASHES[2]}
 
 
-def plot_tracking(history: History, path: str | Path | None = None, *, title: str | None = None) -> Figure:
+def plot_tracking(history: History, path: str | Path | None = None) -> Figure:
     """Figure with a panel per parameter, and one of the fractions of outliers, over time.
 
     Parameters
@@ -40,8 +40,6 @@ def plot_tracking(history: History, path: str | Path | None = None, *, title: st
         With an estimate at least.
     path : str or Path, optional
         ``.png``, ``.svg`` or ``.pdf`` file, written completely or not at all; None writes none.
-    title : str, optional
-        By default the model's name.
 
     Returns
     -------
@@ -55,11 +53,10 @@ def plot_tracking(history: History, path: str | Path | None = None, *, title: st
     """
     check_ending(path)
     signals = history.signals
-    text = history.model.name if title is None else title
     entries: list[LegendEntry] = [("estimate, 95 % interval", {"color": COLOURS[0]}), ("change", _CHANGE)]
     n_rows = len(history.model.parameters) + bool(signals)
     row, digits = 1.5, 0.3  # inches: room for values with many digits, as a parameter moves in its last ones
-    figure, header = headed_figure(entries, text, row * n_rows + 0.45)
+    figure, header = headed_figure(entries, history.model.name, row * n_rows + 0.45)
     shown = slice(None, None, -(-len(history.time) // 2000))  # more points than a panel has pixels
     panels = [panel(figure, digits, header + k * row, WIDTH - digits, row, last=k == n_rows - 1) for k in range(n_rows)]
     for axes, (name, parameter) in zip(panels, history.model.parameters.items(), strict=False):
@@ -106,9 +103,11 @@ def usual_range(y: FloatArray, half: FloatArray) -> tuple[float, float]:
 def _draw_outliers(axes: Axes, history: History, shown: slice) -> None:
     """Fraction of each signal, named by a legend of its own."""
     for k, name in enumerate(history.signals):
-        dashes = DASHES[k // len(COLOURS) % len(DASHES)]
-        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": (0.0, dashes) if dashes else "-"}
-        axes.plot(history.time[shown], history.outliers(name)[shown], linewidth=0.9, label=name, **style)
+        look: dict[str, Any] = {
+            "color": COLOURS[k % len(COLOURS)],
+            "linestyle": DASHES[k // len(COLOURS) % len(DASHES)],
+        }
+        axes.plot(history.time[shown], history.outliers(name)[shown], linewidth=0.9, label=name, **look)
     axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])  # with room for the legend
     axes.set_xlim(*axes.figure.axes[0].get_xlim())
     axes.legend(fontsize=6.5, ncols=5, frameon=False, loc="upper left", labelcolor=INK)

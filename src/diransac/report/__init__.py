@@ -48,7 +48,7 @@ def write_report(
     """
     named, several = labelled(results), _as_list(logs)
     entries = simulate_all(named, several, horizon)
-    write_page(path, "report.html", ["page.css"], "page.js", command=command, **_content(entries, several))
+    write_page(path, "report.html", script="page.js", command=command, **_content(entries, several))
 
 
 def labelled(results: Result | Sequence[Result] | Mapping[str, Result]) -> dict[str, Result]:

@@ -21,7 +21,6 @@ Tick = tuple[str, str]
 """Position in percent of an axis, and text."""
 
 _HEIGHT = 1000
-_FARTHEST = 10**6
 _MARGIN = 0.06
 
 
@@ -52,7 +51,7 @@ class Scale:
     def height(self, values: npt.ArrayLike) -> IntArray:
         """Thousandths of the range from its top; values far outside are clipped."""
         part = (self.high - np.asarray(values, dtype=float)) / (self.high - self.low)
-        return np.rint(np.clip(_HEIGHT * part, -_FARTHEST, _FARTHEST)).astype(np.int64)
+        return np.rint(np.clip(_HEIGHT * part, -(10**6), 10**6)).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -160,6 +159,7 @@ class Plot:
     y_ticks : texts of the values
     full : y of the highest and lowest measured sample, if outside of the scale
     still : True if its x axis is no time, so that it does not zoom with plots of the log
+    heading : text above it
     """
 
     label: str
@@ -172,25 +172,18 @@ class Plot:
     y_ticks: tuple[Tick, ...]
     full: str = ""
     still: bool = False
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A plot with the text above it."""
-
-    plot: Plot
     heading: str = ""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels one above the other on one time axis.
+    """Plots one above the other on one time axis.
 
     Parameters
     ----------
     title, unit : heading
     facts : captions
-    panels : from top to bottom
+    plots : from top to bottom
     time_ticks : texts of the times
     beyond : caption about samples outside of the scale, empty if there are none
     x_label : quantity on the x axis and its unit; empty for time
@@ -199,7 +192,7 @@ class Figure:
     title: str
     unit: str
     facts: tuple[str, ...]
-    panels: tuple[Panel, ...]
+    plots: tuple[Plot, ...]
     time_ticks: tuple[Tick, ...]
     beyond: str = ""
     x_label: str = ""
@@ -211,6 +204,7 @@ def time_plot(
     timeline: Timeline,
     label: str,
     *,
+    heading: str = "",
     look: str = "",
     levels: Sequence[float] = (),
     full: tuple[float, float] | None = None,
@@ -223,6 +217,7 @@ def time_plot(
     ----------
     traces, scale, timeline : series and their axes
     label : description for readers who cannot see the plot
+    heading : text above the plot
     look : CSS classes of the panel
     levels : values marked by a horizontal line
     full : range of all measured samples, where it exceeds the scale
@@ -253,6 +248,7 @@ def time_plot(
         y_ticks=tuple((f"{y / 10:.1f}%", text) for y, (_, text) in zip(heights, marks, strict=True)),
         full="" if full is None else " ".join(str(y) for y in scale.height([full[1], full[0]])),
         still=still,
+        heading=heading,
     )
 
 

@@ -11,7 +11,7 @@ from diransac.data.dataset import Dataset
 from diransac.identification.assessment.inverse_dynamics import PredictedForces, predicted_forces
 from diransac.identification.result import Result
 from diransac.model import Model
-from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
+from diransac.report.figures import Figure, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Entry
 from diransac.text_table import number, percent
 
@@ -84,7 +84,7 @@ def _figure(title: str, joint: str, names: Sequence[str], result: Result, logs: 
     driven = np.concatenate([x.forces[x.counted, i] for x in logs])
     share = float(np.linalg.norm(error) / np.linalg.norm(driven)) if driven.any() else np.nan
     facts = (values, f"predicted force off by {percent(share)} (RMS)") if np.isfinite(share) else (values,)
-    return Figure(title, unit, facts, (Panel(plot),), time_axis(axis), x_label=f"speed, {'rad/s' if turns else 'm/s'}")
+    return Figure(title, unit, facts, (plot,), time_axis(axis), x_label=f"speed, {'rad/s' if turns else 'm/s'}")
 
 
 def _friction(result: Result, i: int, names: Sequence[str], speed: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,12 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
 from diransac.identification.diagnosis import Diagnosis
-from diransac.report.figures import Figure, Panel, Scale, Timeline, Trace, padded, time_axis, time_plot
+from diransac.model import Model
+from diransac.report.figures import Figure, Plot, Scale, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.runs import Run
-from diransac.text_table import number, percent, plural, share
+from diransac.text_table import number, percent, plural, share, some
 
 _VISIBLE = 0.01
-_STRETCHES = 6
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Ti
         title=name,
         unit=unit,
         facts=(f"median error{':' * (len(runs) > 1)} {'; '.join(facts)}",),
-        panels=(Panel(plot), _residuals(name, having, shown, timeline)),
+        plots=(plot, _residuals(name, having, shown, timeline)),
         time_ticks=time_axis(timeline),
         beyond=_beyond_text(beyond),
     )
@@ -231,15 +231,14 @@ def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
             found.append((start, stop, "samples are missing"))
     if not found:
         return []
-    listed = [f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)[:_STRETCHES]]
-    more = f" and {len(found) - _STRETCHES} more" if len(found) > _STRETCHES else ""
-    return [f"Left out: {', '.join(listed)}{more}."]
+    listed = some((f"{number(a, 4)} to {number(b, 4)} s ({why})" for a, b, why in sorted(found)), 6)
+    return [f"Left out: {listed}."]
 
 
 # ---------------------------------------------------------------------- residuals
 
 
-def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Panel:
+def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timeline: Timeline) -> Plot:
     """Simulated minus measured, with the inlier threshold, or with three standard deviations of the noise."""
     traces, ranges = [], []
     for i, run in having:
@@ -255,8 +254,8 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
     scale = _residual_scale(ranges, [run is shown for _, run in having], _VISIBLE * (high - low))
     note = f"; dashed: {meaning}, ±{number(level, 3)}" if levels else ""
     label = f"Residuals of {name}, simulated minus measured{note}"
-    plot = time_plot(traces, scale, timeline, label, look="residual", levels=levels)
-    return Panel(plot, f"simulated − measured{note}")
+    heading = f"simulated − measured{note}"
+    return time_plot(traces, scale, timeline, label, heading=heading, look="residual", levels=levels)
 
 
 def _set_apart(name: str, run: Run, *, is_shown: bool) -> tuple[str, BoolArray]:
@@ -293,41 +292,33 @@ def _unmodelled_about(found: Diagnosis) -> str:
     return f"{text} Dashed: what the suggested terms explain of it." if found.suggested_terms else text
 
 
-def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline) -> list[Figure]:
+def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline) -> Iterator[Figure]:
     """A figure of each unmodelled force, or of each acceleration if the model has no balance of forces."""
-    series = found.unmodelled_forces or found.unmodelled_accelerations
     bands = _bands(run, log, timeline)
-    return [_unmodelled_figure(run, name, values, found, i, timeline, bands) for name, values in series.items()]
+    for name, values in (found.unmodelled_forces or found.unmodelled_accelerations).items():
+        what, unit = _name_and_unit(run.result.model, name, is_force=bool(found.unmodelled_forces))
+        rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unexplained.get(name)
+        relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
+        least = _VISIBLE * rms / fraction if fraction else 0.0
+        scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
+        traces = [Trace(what, f"m{i}", "line", *_steps(found, values, timeline))]
+        if np.any(found.suggested_terms.get(name, 0.0)):
+            explained = _steps(found, found.suggested_terms[name], timeline)
+            traces.append(Trace("suggested terms", "suggested", "line", *explained))
+        label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
+        plot = time_plot(traces, scale, timeline, label, levels=(0.0,), bands=bands)
+        facts = (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",)
+        yield Figure(what, unit, facts, (plot,), time_axis(timeline))
 
 
-def _unmodelled_figure(
-    run: Run,
-    name: str,
-    values: FloatArray,
-    found: Diagnosis,
-    i: int,
-    timeline: Timeline,
-    bands: Mapping[str, BoolArray],
-) -> Figure:
-    model = run.result.model
-    unit = {"m/s^2": "N", "rad/s^2": "N m"}.get(model.units[name], "") if found.unmodelled_forces else model.units[name]
-    coordinate = model.rate_names[list(model.accelerations).index(name)]
-    what = f"force on {coordinate}" if found.unmodelled_forces else name
-    if found.unmodelled_forces and coordinate in model.first_order:
-        what, unit = f"term of {coordinate}", ""
-    rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unexplained.get(name)
-    relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
-    least = _VISIBLE * rms / fraction if fraction else 0.0
-    scale = padded(min(-least, float(values.min())), max(least, float(values.max())))
-    traces = [Trace(what, f"m{i}", "line", *_steps(found, values, timeline))]
-    if np.any(found.suggested_terms.get(name, 0.0)):
-        explained = _steps(found, found.suggested_terms[name], timeline)
-        traces.append(Trace("suggested terms", "suggested", "line", *explained))
-    label = f"Unmodelled {what}{f' in {unit}' if unit else ''}"
-    plot = time_plot(traces, scale, timeline, label, levels=(0.0,), bands=bands)
-    return Figure(
-        what, unit, (f"RMS {number(rms, 2)} {unit}".strip() + f", {relative}",), (Panel(plot),), time_axis(timeline)
-    )
+def _name_and_unit(model: Model, acceleration: str, *, is_force: bool) -> tuple[str, str]:
+    """Name and unit of an unmodelled acceleration, of its force, or of the term of a state of first order."""
+    unit, coordinate = model.units[acceleration], model.rate_names[list(model.accelerations).index(acceleration)]
+    if not is_force:
+        return acceleration, unit
+    if coordinate in model.first_order:
+        return f"term of {coordinate}", ""
+    return f"force on {coordinate}", {"m/s^2": "N", "rad/s^2": "N m"}.get(unit, "")
 
 
 def _steps(found: Diagnosis, values: FloatArray, timeline: Timeline) -> tuple[IntArray, FloatArray]:

@@ -63,14 +63,14 @@ def environment() -> Environment:
     return found
 
 
-def write_page(path: str | Path, template: str, style: Sequence[str], script: str = "", **content: Any) -> None:
+def write_page(path: str | Path, template: str, *, style: str = "", script: str = "", **content: Any) -> None:
     """Write a template as one self-contained page, whole or not at all.
 
     Parameters
     ----------
     path : file of the page
     template : name of the template
-    style, script : names of the style sheets and of the only script that a browser may run
+    style, script : names of a second style sheet and of the only script that a browser may run
     content : values of the template
 
     Raises
@@ -78,12 +78,8 @@ def write_page(path: str | Path, template: str, style: Sequence[str], script: st
     ResultError
         The file cannot be written.
     """
-    code = _asset(script) if script else ""
-    text = (
-        environment()
-        .get_template(template)
-        .render(style="".join(_asset(name) for name in style), script=code, policy=_policy(code), **content)
-    )
+    rules, code = _asset("page.css") + (_asset(style) if style else ""), _asset(script) if script else ""
+    text = environment().get_template(template).render(style=rules, script=code, policy=_policy(code), **content)
     try:
         write_text(path, f"{encodable(text)}\n")
     except OSError as error:
@@ -108,18 +104,13 @@ def _policy(script: str) -> str:
     allowed = "default-src 'none'; style-src 'unsafe-inline'"
     if not script:
         return f"{allowed}; img-src data:"
-    return f"{allowed}; script-src '{_digest(script)}'"
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return f"{allowed}; script-src 'sha256-{digest}'"
 
 
 def script_policy(script: str) -> str:
     """Content security policy of pages with a script, by its name, for those who serve them."""
     return _policy(_asset(script))
-
-
-def _digest(script: str) -> str:
-    """Source of a script by its content."""
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return f"sha256-{digest}"
 
 
 # ---------------------------------------------------------------------- names

@@ -86,7 +86,6 @@ class Run(SimulatedLog):
     result : the result
     view : the result restricted to this log
     first_row : row of the log that is row 0 here
-    diagnosis : of this log, from whichever result of the page has one; None if none has
     open_loop : (N, n_s)   simulated through the whole log from its first row; inliers are defined by it, those of a
         held-out log by the restarted simulation
     validation : open-loop scores at several horizons, or the reason why there are none
@@ -98,7 +97,6 @@ class Run(SimulatedLog):
     result: Result
     view: LogView
     first_row: int
-    diagnosis: Diagnosis | None
     open_loop: FloatArray
     validation: Validation | str
     screened: bool
@@ -236,7 +234,6 @@ def _simulate(
         result=result,
         view=view,
         first_row=first_row,
-        diagnosis=diagnosis,
         open_loop=open_loop,
         validation=validation,
         screened=screened,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,16 +12,13 @@ from diransac.data.log import Log
 from diransac.identification.assessment.horizons import HorizonScores
 from diransac.identification.assessment.innovations import Innovations
 from diransac.identification.assessment.validation import Validation
+from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.evaluation.findings import bounds_text
 from diransac.identification.finding import Finding, Level, Verdict, next_line, shown, verdict_of
 from diransac.report.figures import Scale, Tick, padded, ticks
 from diransac.report.rendering import Table
 from diransac.report.runs import Entry, Run
 from diransac.text_table import number, percent, plural, telling_digits
-
-_LEVELS: Mapping[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
-"""Look of each verdict."""
-
 
 # ---------------------------------------------------------------------- summary
 
@@ -81,7 +79,8 @@ def card(entry: Entry) -> Card:
     verdict, (kept, n_more) = verdict_of(every), shown(every, good=True)
     few = [(about, tuple(x for x in kept if any(x is y for y in found))) for about, found in groups]
     few = [(about, found) for about, found in few if found]
-    return Card(entry.label, _LEVELS[verdict], verdict, tuple(few), n_more, next_line(every))
+    levels: dict[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
+    return Card(entry.label, levels[verdict], verdict, tuple(few), n_more, next_line(every))
 
 
 def _findings_on(run: Run) -> tuple[Finding, ...]:
@@ -283,7 +282,8 @@ def _at(value: float, scale: Scale) -> str:
 
 def diagnosis(entries: Sequence[Entry]) -> list[tuple[Table, str]]:
     """Noise, outliers and unmodelled acceleration of each signal, and the input delay, by each result that has them."""
-    return [(_signal_table(e, len(entries) > 1), _delay(e)) for e in entries if e.result.diagnosis is not None]
+    having = [(entry, entry.result.diagnosis) for entry in entries if entry.result.diagnosis is not None]
+    return [(_signal_table(entry, found, len(entries) > 1), _delay(entry, found)) for entry, found in having]
 
 
 def suggestions(entries: Sequence[Entry]) -> list[Table]:
@@ -315,10 +315,8 @@ def _by(entry: Entry, entries: Sequence[Entry]) -> str:
     return f", by {entry.label}" if len(entries) > 1 else ""
 
 
-def _signal_table(entry: Entry, several: bool) -> Table:
-    found, units = entry.result.diagnosis, entry.result.model.units
-    assert found is not None
-    rows = []
+def _signal_table(entry: Entry, found: Diagnosis, several: bool) -> Table:
+    rows, units = [], entry.result.model.units
     for name in dict.fromkeys((*found.noise_std, *found.unmodelled_accelerations)):
         measured = name in found.noise_std
         noise = number(found.noise_std[name], 2) if measured else "not measured"
@@ -332,9 +330,7 @@ def _signal_table(entry: Entry, several: bool) -> Table:
     return Table(("Signal", "Unit", "Noise", "Outliers", "Unmodelled"), rows, caption)
 
 
-def _delay(entry: Entry) -> str:
-    found = entry.result.diagnosis
-    assert found is not None
+def _delay(entry: Entry, found: Diagnosis) -> str:
     if not found.input_delay_significant:
         return ""
     delay, error = number(1e3 * found.input_delay, 3), number(1e3 * found.input_delay_error, 2)
@@ -356,15 +352,15 @@ def scores(run: Run) -> tuple[str, list[Table]]:
 
 def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
     """Scores of one horizon, beside those of trivial predictions; robust ones where samples are left out of them."""
-    robust = any(x > 0.0 for x in validation.outlier_fraction.values())
+    robust, three_digits = any(x > 0.0 for x in validation.outlier_fraction.values()), partial(number, digits=3)
     columns: list[tuple[str, Mapping[str, float], Callable[[float], str]]] = [
         ("RMSE", at.rmse, number),
         *([("robust RMSE", at.robust_rmse, number)] if robust else []),
         ("hold last", at.hold_last, number),
         ("const. vel.", at.constant_velocity, number),
         ("relative error", at.relative_error, percent),
-        ("fit %", at.fit_percent, _three_digits),
-        *([("robust fit %", at.robust_fit_percent, _three_digits)] if robust else []),
+        ("fit %", at.fit_percent, three_digits),
+        *([("robust fit %", at.robust_fit_percent, three_digits)] if robust else []),
         ("R²", at.r_squared, _r_squared),
         *([("robust R²", at.robust_r_squared, _r_squared)] if robust else []),
     ]
@@ -376,10 +372,6 @@ def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Tab
     lost = f", {at.diverged} diverged" if at.diverged else ""
     header = ("Signal", "Unit", *(title for title, _, _ in columns))
     return Table(header, rows, f"{label}: {at.name}{judged} ({plural(at.windows, 'window')}{lost})")
-
-
-def _three_digits(x: float) -> str:
-    return number(x, 3)
 
 
 def _innovation_table(label: str, one: Innovations, validation: Validation) -> Table:

@@ -22,11 +22,10 @@ from diransac.text_table import number, percent, plural
 _MOST = 200
 """Rows of a table of a fleet, findings and vehicles alike; the page says how many there are more."""
 
-_RELATIVE_TO = (
-    "Errors are relative to the best parameters that the model can reach in the same flight: least squares without "
-    "noise and without vibration. Where these differ from the plant’s own by more than 0.2 %, a second row has the "
-    "errors relative to the plant’s own. 0 is less than 0.001 %; ∞ is a missing estimate."
-)
+
+def _write(path: str | Path, sections: Sequence[Section], **texts: str) -> None:
+    """Write a page of sections.  Raises ResultError: it cannot be written."""
+    write_page(path, "sections.html", style="study.css", sections=sections, **texts)
 
 
 # Studies -------------------------------------------------------------------------------------------------------------
@@ -66,15 +65,7 @@ def write_study_report(store: str | Path, path: str | Path) -> None:
     computed = f"Computed by {'; '.join(summary.versions)}."
     sections.append(Section("Computing time", [_seconds(summary), computed]))
     title = " ".join(title_of(summary).split())
-    write_page(
-        path,
-        "sections.html",
-        ["page.css", "study.css"],
-        title=title,
-        heading=summary.name,
-        about=summary.description,
-        sections=sections,
-    )
+    _write(path, sections, title=title, heading=summary.name, about=summary.description)
 
 
 def _parameter_sections(summary: Summary) -> Iterator[Section]:
@@ -84,7 +75,12 @@ def _parameter_sections(summary: Summary) -> Iterator[Section]:
         return
     worst = _errors(summary, None, "Error of the worst parameter, %: median over a level’s trials [worst]")
     each = {name: _errors(summary, name, f"Error of {name}, %: median [worst]") for name in estimates.errors}
-    yield Section("Error of the worst parameter", [worst, _RELATIVE_TO, each])
+    relative_to = (
+        "Errors are relative to the best parameters that the model can reach in the same flight: least squares without "
+        "noise and without vibration. Where these differ from the plant’s own by more than 0.2 %, a second row has the "
+        "errors relative to the plant’s own. 0 is less than 0.001 %; ∞ is a missing estimate."
+    )
+    yield Section("Error of the worst parameter", [worst, relative_to, each])
     yield Section("Intervals", [_intervals(summary.methods, estimates)])
 
 
@@ -199,15 +195,8 @@ def write_fleet_report(summary: FleetSummary, path: str | Path) -> None:
     failed = Table(["logs", "reason"], failures, "Logs without a result, by reason") if failures else "No log failed."
     sections.append(Section("Failed logs", [failed]))
     title = f"{summary.rows.model}: a fleet of {summary.n_vehicles} vehicles"
-    write_page(
-        path,
-        "sections.html",
-        ["page.css", "study.css"],
-        title=title,
-        heading=title,
-        about=f"{status.done} logs identified, {status.failed} failed, {status.missing} missing",
-        sections=sections,
-    )
+    about = f"{status.done} logs identified, {status.failed} failed, {status.missing} missing"
+    _write(path, sections, title=title, heading=title, about=about)
 
 
 def _parameters(summary: FleetSummary) -> Table:

@@ -11,7 +11,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.tracking.estimates import History
 from diransac.plots.tracking import INTERVAL, usual_range
 from diransac.report import provenance
-from diransac.report.figures import Figure, Panel, Timeline, Trace, padded, time_axis, time_plot
+from diransac.report.figures import Figure, Plot, Timeline, Trace, padded, time_axis, time_plot
 from diransac.report.rendering import Table, write_page
 from diransac.text_table import number, percent, plural
 
@@ -42,8 +42,7 @@ def write_tracking_report(history: History, path: str | Path, *, command: str = 
     write_page(
         path,
         "tracking.html",
-        ["page.css"],
-        "page.js",
+        script="page.js",
         title=f"{model.name}, tracked",
         heading=model.name,
         about=model.description,
@@ -150,7 +149,7 @@ def _parameter_figure(history: History, name: str, axis: _Axis) -> Figure:
     label = f"{name} in {unit or '1'} over time, with its 95 % interval"
     plot = time_plot(traces, padded(*usual_range(y, half)), axis.timeline, label, bands=bands)
     facts = (plural(len(changes), "change"),) if changes else ()
-    return _figure(name, unit, facts, [Panel(plot)], axis)
+    return _figure(name, unit, facts, [plot], axis)
 
 
 def _signal_figures(history: History, axis: _Axis) -> list[Figure]:
@@ -158,19 +157,19 @@ def _signal_figures(history: History, axis: _Axis) -> list[Figure]:
     units, figures = history.model.units, []
     for name in history.signals:
         share, noise = history.outliers(name), history.noise(name)
-        panels = []
+        plots = []
         for values, heading, unit in ((share, "fraction of outliers", ""), (noise, "noise", units[name])):
             known = values[np.isfinite(values)]
             scale = padded(0.0, float(known.max(initial=0.0)) or 1.0)
             text = f"{heading} of {name}{f' in {unit}' * bool(unit)} over time"
-            plot = time_plot([axis.trace(heading, "m0", values)], scale, axis.timeline, text, look="residual")
-            panels.append(Panel(plot, f"{heading}{f', {unit}' * bool(unit)}"))
+            above, trace = f"{heading}{f', {unit}' * bool(unit)}", axis.trace(heading, "m0", values)
+            plots.append(time_plot([trace], scale, axis.timeline, text, heading=above, look="residual"))
         at_end = f"at the end {percent(float(share[-1]))}, noise {number(float(noise[-1]), 2)} {units[name]}".rstrip()
-        figures.append(_figure(name, units[name], (at_end,), panels, axis))
+        figures.append(_figure(name, units[name], (at_end,), plots, axis))
     return figures
 
 
-def _figure(title: str, unit: str, facts: tuple[str, ...], panels: Sequence[Panel], axis: _Axis) -> Figure:
-    """Panels on the axis of the run."""
+def _figure(title: str, unit: str, facts: tuple[str, ...], plots: Sequence[Plot], axis: _Axis) -> Figure:
+    """Plots on the axis of the run."""
     label = "" if axis.is_time else "estimate"
-    return Figure(title, unit, facts, tuple(panels), time_axis(axis.timeline), x_label=label)
+    return Figure(title, unit, facts, tuple(plots), time_axis(axis.timeline), x_label=label)

@@ -8,10 +8,13 @@ entity                    contents
 ``/x/outliers``           samples that are outliers, as points
 ``/inputs/thrust``        an input
 ``/unmodelled/x``         unmodelled force, or acceleration, means over windows; of logs of the identification
-``/replay``               bodies of a machine that MuJoCo simulates (`replay`), in logs of the identification
+``/replay/measured/b``    body ``b`` of a machine that MuJoCo simulates, in logs of the identification: in the motion
+                          that follows the samples from interval to interval
+``/replay/predicted/b``   body ``b`` in the simulation that restarts where a report's does
 ========================  ====================================================================================
 
-Entities of several logs stand below the name of their log.
+Entities of several logs stand below the name of their log. Bodies have the shapes of their geoms; hulls of meshes are
+not simplified, and planes and height fields are left out.
 """
 
 from __future__ import annotations
@@ -29,10 +32,12 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
 from diransac.data.segment import runs
 from diransac.errors import ResultError
+from diransac.identification.assessment.open_loop import simulate
 from diransac.identification.result import Result
+from diransac.model.mjcf import MujocoModel
+from diransac.model.robots.description import mujoco_module
 from diransac.plain_text import one_line
 from diransac.report.rendering import encodable
-from diransac.report.replay import can_replay, send_replay
 from diransac.report.runs import Entry, Run, simulate_all
 
 _MEASURED, _PREDICTED, _OUTLIERS, _OTHER = (120, 120, 120), (31, 119, 180), (214, 39, 40), (44, 160, 44)
@@ -144,8 +149,8 @@ def _write(rerun: Any, entry: Entry, file: Path) -> None:
             layout.TimeSeriesView(origin=rerun.new_entity_path([*above, _text(group)]), name=_text(group))
             for group in dict.fromkeys(one.path[0] for one in series)
         ]
-        if can_replay(run):
-            send_replay(rerun, recording, above, run, {"measured": _MEASURED, "predicted": _PREDICTED})
+        if _can_replay(run):
+            _send_replay(rerun, recording, above, run)
             views.insert(0, layout.Spatial3DView(origin=rerun.new_entity_path([*above, "replay"]), name="replay"))
         tabs.append(layout.Grid(*views, name=_text(run.log_name)))
     whole = layout.Tabs(*tabs) if several else tabs[0]
@@ -169,3 +174,104 @@ def _send(rerun: Any, recording: Any, path: str, series: _Series) -> None:
 def _text(text: str) -> str:
     """Text of one line in Unicode."""
     return encodable(one_line(text))
+
+
+# ---------------------------------------------------------------------- bodies
+
+
+def _can_replay(run: Run) -> bool:
+    """True if there are bodies, and the motion of the log is known."""
+    return isinstance(run.result.model, MujocoModel) and run.view.diagnosis is not None
+
+
+def _send_replay(rerun: Any, recording: Any, above: list[str], run: Run) -> None:
+    """Send the bodies' shapes, and at most 50 of their poses a second, below parts of a path."""
+    found, log = run.view.diagnosis, run.observations.log
+    assert found is not None
+    interval = float(np.median(np.diff(found.smoothed_time)))
+    for kind, horizon, colour in (("measured", interval, _MEASURED), ("predicted", run.restart_period, _PREDICTED)):
+        simulated = simulate(run.result, log, horizon=max(horizon, interval))
+        q = np.column_stack([simulated[name] for name in run.result.model.coordinates])
+        every = max(1, round(1.0 / (50.0 * simulated.dt)))
+        q, time = q[::every], simulated.time[::every]
+        known = np.isfinite(q).all(axis=1)
+        for body, (places, rotations) in _poses(run, q[known]).items():
+            path = rerun.new_entity_path([*above, "replay", kind, body])
+            poses = rerun.Transform3D.columns(translation=places, quaternion=rotations)
+            recording.send_columns(path, [rerun.TimeColumn("time", duration=time[known])], poses)
+        for body, k, shape in _shapes(rerun, run, colour):
+            recording.log(rerun.new_entity_path([*above, "replay", kind, body, str(k)]), shape, static=True)
+
+
+def _poses(run: Run, q: FloatArray) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Places ``(N, 3)`` and quaternions ``(N, 4)``, the real part last, of all bodies with geoms, by name."""
+    module, compiled = mujoco_module(), _compiled(run)
+    data = module.MjData(compiled)
+    places, rotations = np.empty((len(q), compiled.nbody, 3)), np.empty((len(q), compiled.nbody, 4))
+    for k, one in enumerate(q):
+        data.qpos[:] = one
+        module.mj_kinematics(compiled, data)
+        places[k], rotations[k] = data.xpos, data.xquat[:, [1, 2, 3, 0]]
+    return {_name(compiled, b): (places[:, b], rotations[:, b]) for b in sorted({*compiled.geom_bodyid.tolist()} - {0})}
+
+
+def _shapes(rerun: Any, run: Run, colour: tuple[int, int, int]) -> Iterator[tuple[str, int, Any]]:
+    """Name of the body, number, and shape of each geom that moves."""
+    compiled = _compiled(run)
+    kinds = mujoco_module().mjtGeom
+    for k in range(compiled.ngeom):
+        body, size = int(compiled.geom_bodyid[k]), compiled.geom_size[k]
+        if body == 0:
+            continue
+        places, rotations = [compiled.geom_pos[k]], [compiled.geom_quat[k][[1, 2, 3, 0]]]
+        pose = {"centers": places, "quaternions": rotations, "colors": [colour]}
+        kind, shape = kinds(int(compiled.geom_type[k])), None
+        if kind == kinds.mjGEOM_BOX:
+            shape = rerun.Boxes3D(half_sizes=[size], **pose)
+        elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
+            sizes = np.full(3, size[0]) if kind == kinds.mjGEOM_SPHERE else size
+            shape = rerun.Ellipsoids3D(half_sizes=[sizes], **pose)
+        elif kind == kinds.mjGEOM_CYLINDER:
+            shape = rerun.Cylinders3D(lengths=[2.0 * size[1]], radii=[size[0]], **pose)
+        elif kind == kinds.mjGEOM_CAPSULE:
+            shape = _capsule(rerun, compiled, k, colour)
+        elif kind == kinds.mjGEOM_MESH:
+            shape = _mesh(rerun, compiled, k, colour)
+        if shape is not None:
+            yield _name(compiled, body), k, shape
+
+
+def _capsule(rerun: Any, compiled: Any, geom: int, colour: tuple[int, int, int]) -> Any:
+    """A geom's capsule, which the viewer counts from one of its ends, in the frame of its body."""
+    radius, half = compiled.geom_size[geom][:2]
+    axis = np.empty(3)
+    mujoco_module().mju_rotVecQuat(axis, np.array([0.0, 0.0, half]), compiled.geom_quat[geom])
+    return rerun.Capsules3D(
+        lengths=[2.0 * half],
+        radii=[radius],
+        translations=[compiled.geom_pos[geom] - axis],
+        quaternions=[compiled.geom_quat[geom][[1, 2, 3, 0]]],
+        colors=[colour],
+    )
+
+
+def _mesh(rerun: Any, compiled: Any, geom: int, colour: tuple[int, int, int]) -> Any:
+    """Triangles of a geom, in the frame of its body."""
+    mesh = int(compiled.geom_dataid[geom])
+    first, n = compiled.mesh_vertadr[mesh], compiled.mesh_vertnum[mesh]
+    face, m = compiled.mesh_faceadr[mesh], compiled.mesh_facenum[mesh]
+    rotation = np.empty(9)
+    mujoco_module().mju_quat2Mat(rotation, compiled.geom_quat[geom])
+    vertices = compiled.mesh_vert[first : first + n] @ rotation.reshape(3, 3).T + compiled.geom_pos[geom]
+    triangles = compiled.mesh_face[face : face + m]
+    return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=colour)
+
+
+def _compiled(run: Run) -> Any:
+    model = run.result.model
+    assert isinstance(model, MujocoModel)
+    return model.compiled
+
+
+def _name(compiled: Any, body: int) -> str:
+    return compiled.body(body).name or f"body {body}"

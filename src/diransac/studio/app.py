@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import io
-import json
 import tokenize
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from starlette.applications import Starlette
@@ -21,26 +20,18 @@ from starlette.routing import Route
 
 from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.limits import read_bytes
-from diransac.plain_text import one_line, printable
-from diransac.studio.folders import Folders
+from diransac.plain_data import json_data, json_text
+from diransac.plain_text import printable
+from diransac.studio.folders import MODELS, Folders
 from diransac.studio.jobs import Jobs
 from diransac.studio.project import NAME, Project
 from diransac.studio.scene import Scenes
 from diransac.studio.series import Logs, Shown
 from diransac.studio.stages import CALLS_CODE, RESULTS, command, lines
 
-if TYPE_CHECKING:
-    from diransac.identification.result import Result
-
 _STATIC = Path(__file__).parent / "static"
-_KEEP_ALIVE = 5.0
-_MOST_CELLS = 4000
 _MOST_SHOWN = 100_000
 """Characters of a program that is shown to be confirmed."""
-_OF_RESULT = {
-    *("parameters", "units", "fixed", "intervals_95", "structural_intervals_95", "verdict", "findings", "suggestions"),
-}
-_PAGES = {"solve": "report", "validate": "held-out"}
 
 
 class Studio:
@@ -76,7 +67,7 @@ class Studio:
         """Wait for a version later than the known one; False where there is none for a while."""
         if self.version == known and not self.ended:
             try:
-                await asyncio.wait_for(self._news.wait(), _KEEP_ALIVE)
+                await asyncio.wait_for(self._news.wait(), timeout=5.0)
             except TimeoutError:
                 return False
         return True
@@ -224,7 +215,7 @@ class Studio:
 
 def _first_project(named: list[str]) -> Project:
     """A project of the files that were named: logs, and a model."""
-    models = [name for name in named if name.endswith((".urdf", ".mjcf", ".xml", ".py", ".json"))]
+    models = [name for name in named if name.endswith(MODELS)]
     return Project(logs=[name for name in named if name not in models], model=next(iter(models), None))
 
 
@@ -300,7 +291,7 @@ async def _log(studio: Studio, request: Request) -> Response:
 async def _series(studio: Studio, request: Request) -> Response:
     query = request.query_params
     begin, end = float(query["begin"]), float(query["end"])
-    width = min(int(query["width"]), _MOST_CELLS)
+    width = min(int(query["width"]), 4000)  # more cells than a screen has columns
 
     def content() -> bytes:
         shown, parts = studio.shown(query["name"]), []
@@ -332,20 +323,18 @@ async def _result(studio: Studio, request: Request) -> Response:
         raise LogError("there is no such result")
     result = await run_in_threadpool(Result.load, studio.folders.find(name))
     rows = [] if result.competition is None else result.competition.lines()
-    shown = {key: value for key, value in result.to_dict().items() if key in _OF_RESULT}
-    for key, intervals in (("intervals_text", result.intervals()), ("structural_text", _structural(result))):
+    keys = ("parameters", "units", "fixed", "verdict", "findings", "suggestions")
+    shown = {key: value for key, value in result.to_dict().items() if key in keys or key.endswith("intervals_95")}
+    structural = result.structural_intervals() if result.has_structure else {}
+    for key, intervals in (("intervals_text", result.intervals()), ("structural_text", structural)):
         shown[key] = {name: interval_text(*ends) for name, ends in intervals.items()}
     shown["changes"] = [x.change for x in result.suggestions]
     return _answer({**shown, "competition": {"header": rows[0], "rows": rows[1:]} if rows else None})
 
 
-def _structural(result: Result) -> Mapping[str, tuple[float, float]]:
-    return result.structural_intervals() if result.has_structure else {}
-
-
 async def _report(studio: Studio, request: Request) -> Response:
     """A page of results: it may run the script of reports alone, and is a page of another origin to the browser."""
-    name = _PAGES[request.query_params["kind"]]
+    name = {"solve": "report", "validate": "held-out"}[request.query_params["kind"]]
     limb = Path(request.query_params.get("result", "")).stem.removeprefix("model")
     path = studio.folders.find(f"{RESULTS}/{name}{limb if name == 'report' else ''}.html")
     from diransac.report.rendering import script_policy
@@ -435,8 +424,6 @@ def _endpoint(studio: Studio, call: Endpoint) -> Callable[[Request], Awaitable[R
 
 async def _body(request: Request) -> dict[str, Any]:
     """The request's JSON.  Raises SettingsError: it is none."""
-    from diransac.plain_data import json_data
-
     if request.headers.get("content-type") != "application/json":
         raise SettingsError("the body is not JSON")
     found = json_data(await request.body())
@@ -446,16 +433,7 @@ async def _body(request: Request) -> dict[str, Any]:
 
 
 def _json(data: Any) -> str:
-    return one_line(printable(json.dumps(_finite(data), ensure_ascii=False)))
-
-
-def _finite(data: Any) -> Any:
-    """Data in which numbers that are not finite are None."""
-    if isinstance(data, float):
-        return data if np.isfinite(data) else None
-    if isinstance(data, Mapping):
-        return {str(key): _finite(value) for key, value in data.items()}
-    return [_finite(value) for value in data] if isinstance(data, list | tuple) else data
+    return printable(json_text(data))
 
 
 def _answer(data: Mapping[str, Any], status: int = 200) -> Response:

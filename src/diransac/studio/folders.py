@@ -26,7 +26,7 @@ _LOGS = (
     ".mcap",
     ".bag",
 )
-_MODELS = (".urdf", ".mjcf", ".xml", ".py", ".json")
+MODELS = (".urdf", ".mjcf", ".xml", ".py", ".json")
 _MOST, _DEEPEST = 2000, 5
 
 
@@ -132,7 +132,7 @@ class Folders:
                 folders[:] = [] if deep else sorted(x for x in folders if x[0] != "." and x != "__pycache__")
                 for name in sorted(files):
                     path, lower = folder / name, name.lower()
-                    if lower.endswith((*_LOGS, *_MODELS)) and self._is_inside(path):
+                    if lower.endswith((*_LOGS, *MODELS)) and self._is_inside(path):
                         yield path, lower.endswith(_LOGS)
 
     def _is_inside(self, path: Path) -> bool:

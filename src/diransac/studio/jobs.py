@@ -17,8 +17,6 @@ from typing import Any
 from diransac.studio.project import quoted
 from diransac.user_files import CONFIRMED
 
-_LONGEST_LINE, _MOST_STEPS = 1 << 22, 200
-
 
 @dataclass
 class Job:
@@ -111,7 +109,7 @@ class Jobs:
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.PIPE,
-                limit=_LONGEST_LINE,
+                limit=1 << 22,  # of a line, bytes
                 start_new_session=True,
                 pass_fds=self._held[:1],
             )
@@ -175,7 +173,7 @@ class Jobs:
                 said += [line] if line else []
                 continue
             if isinstance(step, dict):
-                job.steps = [*job.steps, step | {"seconds": time.monotonic() - job.began}][-_MOST_STEPS:]
+                job.steps = [*job.steps, step | {"seconds": time.monotonic() - job.began}][-200:]
                 self._changed()
         return said
 

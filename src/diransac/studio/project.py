@@ -18,7 +18,7 @@ from diransac.atomic import write_text
 from diransac.errors import ResultError, SettingsError
 from diransac.plain_data import toml_file
 from diransac.plain_text import literal, one_line, printable
-from diransac.user_files import file_and_name
+from diransac.user_files import file_and_name, is_description
 
 NAME = "project.diransac.toml"
 
@@ -26,15 +26,12 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Text = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00\n\r]*$")]
 _Stretch = Annotated[list[_Number], Field(min_length=2, max_length=2)]
 _READING = ["mapping", "columns", "rate", "repair", "map", "scale", "resample", "unmeasured", "episodes"]
-_STEPS = ["from", "until", "while", "leave-out", "despike", "shift"]
 _ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base"]
+_STEPS = ["from", "until", "while", "leave-out", "despike", "shift"]
 _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
     *("with-suggestions", "add-terms", "time-limit", "differentiate", "bandwidth"),
 ]
-_LISTED = {"columns", "repair", "unmeasured", "while", "despike", "unknown", "bodies", "add-terms"}
-"""Options whose value is one text with commas."""
-_DESCRIPTIONS = (".xml", ".mjcf", ".urdf")
 
 
 def _hyphened(name: str) -> str:
@@ -126,12 +123,12 @@ class Project(BaseModel):
     @property
     def names_robot(self) -> bool:
         """True for a model from a description, which alone takes options of a robot."""
-        return Path(self.model or "").suffix.lower() in _DESCRIPTIONS
+        return is_description(self.model or "")
 
     @property
     def code(self) -> str:
         """The file of the user's own code that the model is, or an empty text."""
-        found = _code_and_name(self.model or "")
+        found = file_and_name(self.model or "", "")
         return "" if found is None else str(found[0])
 
     @property
@@ -158,7 +155,7 @@ class Project(BaseModel):
         """Arguments of ``identify``, of files beside the project."""
         model = self.words_of_model(folder)
         chosen = ["--model", *model] if model else []
-        logs = [_hyphenless(str(folder / log)) for log in self.logs]
+        logs = [hyphenless(str(folder / log)) for log in self.logs]
         return [*logs, *chosen, *self.words_of_reading(folder), *self._words(_SEARCH, folder)]
 
     def _words(self, keys: Sequence[str], folder: Path) -> Iterator[str]:
@@ -166,12 +163,13 @@ class Project(BaseModel):
         for key in keys:
             if key in options:
                 named = f"--{'set' if key == 'settings' else key}"
+                if options[key] is True:
+                    yield named
+                    continue
                 for text in _texts(key, options[key]):
                     is_file = key == "mapping" and self.mapping_file
-                    placed = _hyphenless(str(folder / text)) if is_file else text
-                    yield from (
-                        [named] if text is _FLAG else [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
-                    )
+                    placed = hyphenless(str(folder / text)) if is_file else text
+                    yield from [f"{named}={placed}"] if text[:1] == "-" else [named, placed]
 
     # ------------------------------------------------------------------ Python
 
@@ -181,7 +179,7 @@ class Project(BaseModel):
         lines = ["import diransac as dr", *self._python_of_model()]
         read = {"rename" if key == "map" else key: options[key] for key in _READING if key in options}
         episodes = "" if read.pop("episodes", None) is None else ", episodes=[...]"
-        listed = ", ".join(map(_quoted, self.logs))
+        listed = ", ".join(map(repr, self.logs))
         lines += [f"logs = [log for file in [{listed}] for log in dr.read_logs(file{_given(read)}{episodes})]"]
         steps = {key.replace("-", "_"): options[key] for key in _STEPS if key in options}
         if steps:
@@ -199,16 +197,16 @@ class Project(BaseModel):
             given |= {"bodies": "all"} if given.get("bodies") == ["all"] else {}
             kinds = (("control", "PositionControl"), ("motor", "MotorCurrents"))
             drive = "".join(f", actuation=dr.{kind}({_given(options[k])[2:]})" for k, kind in kinds if k in options)
-            return [f"model = dr.models.robot({_quoted(self.model)}{_given(given)}{drive})"]
-        code = _code_and_name(self.model)
+            return [f"model = dr.models.robot({self.model!r}{_given(given)}{drive})"]
+        code = file_and_name(self.model, "")
         if code is not None:
             stem, name = code[0].stem, code[1] or "model"
             if not (_is_name(stem) and _is_name(name)):  # no import can name it
                 return []
             return [f"from {stem} import {name}" + ("" if name == "model" else " as model")]
         if self.model.endswith(".json"):
-            return [f"model = dr.Result.load({_quoted(self.model)}).model"]
-        return [f"model = dr.models.builtin({_quoted(self.model)})"]
+            return [f"model = dr.Result.load({self.model!r}).model"]
+        return [f"model = dr.models.builtin({self.model!r})"]
 
     def _python_of_search(self, options: Mapping[str, Any]) -> list[str]:
         named = {"fix": "fixed", "prior": "priors", "add-terms": "with_suggestions"}
@@ -216,23 +214,18 @@ class Project(BaseModel):
         settings, method, lines = given.pop("settings", None), options.get("method"), list[str]()
         given["fixed"] = {n: None if x == "nominal" else x for n, x in given.get("fixed", {}).items()} or None
         given["priors"] = {n: tuple(x) for n, x in given.get("priors", {}).items()} or None
-        chosen = "" if method is None else f", {_quoted(method)}"
+        chosen = "" if method is None else f", {method!r}"
         if settings is not None:
             lines = ["from diransac.identification.methods import configured"]
-            chosen = f", configured({_quoted(method or 'lo-diransac')}, {settings!r})"
+            chosen = f", configured({method or 'lo-diransac'!r}, {settings!r})"
         return [*lines, f"result = dr.identify(model, logs{chosen}{_given(given)})", printed("result")]
 
 
-_FLAG = "true"
-
-
 def _texts(key: str, value: Any) -> list[str]:
-    """Values of an option on the command line; `_FLAG` itself for one without a value."""
-    if value is True:
-        return [_FLAG]
+    """Values of an option on the command line."""
     if key == "leave-out":
         return [",".join(f"{a:.12g}:{b:.12g}" for a, b in value)] if value else []
-    if key in _LISTED:
+    if isinstance(value, list):
         return [",".join(value)]
     if isinstance(value, dict):
         pairs = [_pair(key, name, x) for name, x in value.items()]
@@ -251,16 +244,11 @@ def _pair(key: str, name: str, value: Any) -> str:
     return name if (key, value) == ("fix", "nominal") else f"{name}={value}"
 
 
-def _code_and_name(model: str) -> tuple[Path, str] | None:
-    """The file of code that a model is, as the command line understands it, and its name there, which may be empty."""
-    return None if Path(model).suffix.lower() in (*_DESCRIPTIONS, ".json") else file_and_name(model, "")
-
-
 def _placed(model: str, folder: Path) -> str:
     """A model beside the project as the command finds it, never a word that begins like an option."""
-    file, name = _code_and_name(model) or (Path(model), "")
+    file, name = file_and_name(model, "") or (Path(model), "")
     is_file = file.suffix or "/" in model
-    return _hyphenless(f"{folder / file}{name and ':'}{name}" if is_file else model)
+    return hyphenless(f"{folder / file}{name and ':'}{name}" if is_file else model)
 
 
 def _is_name(text: str) -> bool:
@@ -268,7 +256,8 @@ def _is_name(text: str) -> bool:
     return text.isidentifier() and not keyword.iskeyword(text)
 
 
-def _hyphenless(text: str) -> str:
+def hyphenless(text: str) -> str:
+    """Name of a file that no command takes for an option."""
     return f"./{text}" if text.startswith("-") else text
 
 
@@ -276,10 +265,6 @@ def _given(arguments: Mapping[str, Any]) -> str:
     """Keyword arguments after others."""
     given = ((name, value) for name, value in arguments.items() if value is not None)
     return "".join(f", {n}={x!r}" if _is_name(n) else f", **{ {n: x}!r}" for n, x in given)
-
-
-def _quoted(text: str) -> str:
-    return repr(text)
 
 
 def printed(expression: str) -> str:

@@ -25,10 +25,6 @@ from diransac.errors import ModelError
 if TYPE_CHECKING:
     from diransac.data.log import Log
 
-_FRAMES, _PATIENCE = 500, 30.0
-_MOST_NUMBERS = 30_000_000
-"""Coordinates of the corners of all shapes."""
-
 
 class Scenes:
     """Process that makes scenes; it is started with the first one."""
@@ -63,7 +59,7 @@ class Scenes:
         time = _moments(measured)
         columns = [_at(log, time) for log in (measured, predicted)]
         try:
-            return self._pool.submit(_content, model, path, list(roots), time, columns).result(_PATIENCE)
+            return self._pool.submit(_content, model, path, list(roots), time, columns).result(timeout=30.0)
         except (BrokenProcessPool, TimeoutError) as error:
             self.close()
             raise ModelError("the description cannot be drawn: MuJoCo ended, or took too long") from error
@@ -78,9 +74,10 @@ class Scenes:
 
 
 def _moments(log: Log | None) -> FloatArray:
+    """Times of at most 500 frames, s."""
     if log is None:
         return np.zeros(1)
-    return np.asarray(log.time[np.unique(np.linspace(0, len(log) - 1, _FRAMES).astype(np.int64))])
+    return np.asarray(log.time[np.unique(np.linspace(0, len(log) - 1, 500).astype(np.int64))])
 
 
 def _at(log: Log | None, time: FloatArray) -> dict[str, FloatArray]:
@@ -120,7 +117,7 @@ def _content(
         raise ModelError(f"the description cannot be drawn: {' '.join(str(error).split())}") from error
     chosen = _shown_geoms(compiled)
     corners = [_corners(compiled, k) for k in chosen]
-    if sum(map(np.size, corners)) > _MOST_NUMBERS:
+    if sum(map(np.size, corners)) > 30_000_000:  # coordinates
         raise ModelError("the description cannot be drawn: its meshes have too many corners")
     places = [_places(compiled, chosen, values, len(time)) for values in columns if values] or [
         _places(compiled, chosen, {}, 1)

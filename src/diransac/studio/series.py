@@ -21,10 +21,8 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from diransac.data.readers.topics import TopicTable
 
-_MOST_NUMBERS, _BLOCK = 150_000_000, 256
-_MOST_SCANNED = 4_000_000
-"""Rows of a signal that is searched for outliers."""
-_MOST_FIELDS, _MOST_MARKED = 40, 3000
+_BLOCK = 256
+"""Rows whose extremes are computed once."""
 
 
 @dataclass
@@ -94,7 +92,7 @@ class Shown:
             blocks = self._blocks_of(name)
             size, begin_block = size // _BLOCK, first // _BLOCK
             first, ends = begin_block * _BLOCK, -(-last // _BLOCK)
-            low, high = _least(blocks[0][begin_block:ends], size), -_least(-blocks[1][begin_block:ends], size)
+            low, high = (_extremes(x[begin_block:ends], size)[k] for k, x in enumerate(blocks))
             size *= _BLOCK
         return float(log.time[first] + 0.5 * (size - 1) * log.dt), size * log.dt, low, high
 
@@ -104,7 +102,7 @@ class Shown:
         The number is -1 for a log of too many rows to be searched.
         """
         log = self.log
-        if len(log) > _MOST_SCANNED:
+        if len(log) > 4_000_000:
             return np.zeros(0), np.zeros(0), -1
         with self._alone:  # a view that moves on asks again while the first search goes on
             if name not in self._outliers:
@@ -115,7 +113,7 @@ class Shown:
                 self._outliers[name] = known[marked]
         rows = self._outliers[name]
         inside = rows[(log.time[rows] >= begin) & (log.time[rows] <= end)]
-        thinned = inside[:: 1 + len(inside) // _MOST_MARKED]
+        thinned = inside[:: 1 + len(inside) // 3000]
         return log.time[thinned], log[name][thinned], len(rows)
 
     def _blocks_of(self, name: str) -> tuple[FloatArray, FloatArray]:
@@ -135,11 +133,6 @@ def _extremes(values: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def _least(values: FloatArray, size: int) -> FloatArray:
-    """Least of every ``size`` values."""
-    return values if size == 1 else _extremes(values, size)[0]
-
-
 class Logs:
     """Logs that were read, the latest first; older ones are dropped where they fill the memory."""
 
@@ -157,12 +150,13 @@ class Logs:
             if key not in self._known:
                 self._known[key] = _shown(path, reading)
             self._known.move_to_end(key)
-            while len(self._known) > 1 and sum(map(_size, self._known.values())) > _MOST_NUMBERS:
+            while len(self._known) > 1 and sum(map(_size, self._known.values())) > 150_000_000:
                 self._known.popitem(last=False)
             return self._known[key]
 
 
 def _size(shown: Shown) -> int:
+    """Numbers that a log keeps in memory."""
     return len(shown.log) * (1 + len(shown.log.names))
 
 
@@ -180,7 +174,7 @@ def _shown(path: Path, reading: Mapping[str, Any]) -> Shown:
             why = str(error)
     else:
         why = "no topic is mapped to a signal yet"
-    log = _read(path, plain) if topics is None else _read_fields(path, list(labels[:_MOST_FIELDS]))
+    log = _read(path, plain) if topics is None else _read_fields(path, list(labels[:40]))
     return Shown(log, why, labels or _columns(log, {}))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from diransac.errors import SettingsError
 from diransac.plain_text import printable
-from diransac.studio.project import Project, printed, quoted
+from diransac.studio.project import Project, hyphenless, printed, quoted
 
 RESULTS = "diransac-results"
 """Folder of what the commands write, below the first folder."""
@@ -53,11 +53,11 @@ def _log(project: Project, given: Mapping[str, Any]) -> str:
     name = given.get("log") or next(iter(project.logs), None)
     if not isinstance(name, str):
         raise SettingsError("there is no log yet; choose one")
-    return f"./{name}" if name.startswith("-") else name
+    return hyphenless(name)
 
 
 def _logs(project: Project) -> list[str]:
-    return [_log(project, {"log": name}) for name in project.logs] or [_log(project, {})]
+    return [hyphenless(name) for name in project.logs] or [_log(project, {})]
 
 
 def _solved(results: Sequence[str]) -> list[str]:
@@ -92,8 +92,8 @@ def _design(project: Project, given: Mapping[str, Any], results: Sequence[str]) 
 
 
 def _solve(project: Project, _given: Mapping[str, Any], _results: Sequence[str]) -> list[str]:
-    if not project.logs:
-        raise SettingsError("there is no log yet; choose one")
+    # Both are needed, and then taken by the project's own words.
+    _logs(project)
     _model(project)
     # Not by the file of the project, which may have changed since its model was confirmed.
     return ["identify", *project.words(), "-o", _MODEL, "--report", f"{RESULTS}/report.html"]
@@ -102,7 +102,7 @@ def _solve(project: Project, _given: Mapping[str, Any], _results: Sequence[str])
 def _validate(project: Project, given: Mapping[str, Any], results: Sequence[str]) -> list[str]:
     if not project.held_out:
         raise SettingsError("no log is held out; set one aside in Data")
-    held_out = [_log(project, {"log": name}) for name in project.held_out]
+    held_out = map(hyphenless, project.held_out)
     page = f"{RESULTS}/held-out.html"
     return ["validate", _chosen(given, results), *held_out, *_horizon(given), "--report", page]
 

@@ -9,8 +9,8 @@ import typer
 
 from diransac.cli import screen
 from diransac.cli.arguments import numbers
+from diransac.cli.commands import grouped
 from diransac.cli.flight_options import FlightPicture, LogOutput
-from diransac.cli.group import grouped
 from diransac.cli.options import (
     Derivation,
     JsonFlag,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import names, toml_value
+from diransac.cli.arguments import assigned, names
 from diransac.cli.options import JsonFlag
-from diransac.cli.outputs import PAGE, check_ending, checked, staged
+from diransac.cli.outputs import PAGE, check_ending, staged
 from diransac.cli.rows import Cluster, Jobs, running
 from diransac.errors import SettingsError
 from diransac.identification.methods import METHODS
@@ -41,17 +41,6 @@ def _listed(option: str, text: str | None) -> list[str] | None:
     return found
 
 
-def _changes(assignments: Sequence[str]) -> dict[str, Any]:
-    """Values of ``path.to.key=value`` by path.  Raises typer.BadParameter: another form."""
-    found = {}
-    for text in assignments:
-        path, equals, value = (part.strip() for part in text.partition("="))
-        if not equals or not all(path.split(".")):
-            raise typer.BadParameter(f"--set: {text!r} is not key=value, such as plant.convention=printed")
-        found[path] = toml_value(value)
-    return found
-
-
 @study.command("run")
 def _run(
     source: Annotated[str, typer.Argument(metavar="NAME|FILE.toml", help=f"{', '.join(builtin_names())}, or a file.")],
@@ -73,7 +62,8 @@ def _run(
     as_json: JsonFlag = False,
 ) -> None:
     """Run the trials that a store lacks; after an interruption, the same command runs the rest."""
-    wanted = load(source, _changes(assignments or ()))
+    changes = {".".join(keys): value for keys, value in assigned(assignments or (), "plant.convention=printed")}
+    wanted = load(source, changes)
     wanted = wanted.subset(trials, _listed("--levels", levels), _listed("--methods", methods))
     with running(wanted.name, store, jobs, cluster) as how:
         found = run_study(wanted, store=store, time_limit=time_limit, **how)
@@ -156,7 +146,6 @@ def _report(store: StoreArgument, output: Page) -> None:
     """Write a store as one HTML page: figures, tables, failures and run times."""
     from diransac.report.stores import write_study_report
 
-    checked([output], [store])
     check_ending(output, PAGE)
     with staged([output], [store]) as (written,):
         write_study_report(store, written)
@@ -235,7 +224,6 @@ def _fleet_report(store: StoreArgument, output: Page) -> None:
     """Write a store as one HTML page: findings, figures, tables and failures."""
     from diransac.report.stores import write_fleet_report
 
-    checked([output], [store])
     check_ending(output, PAGE)
     with staged([output], [store]) as (written,):
         write_fleet_report(summarise_fleet(store), written)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from diransac.cli import screen
-from diransac.cli.arguments import fixed_parameters, model_file, preparation_of, start_values
+from diransac.cli.arguments import fixed_parameters, is_result, model_file, preparation_of, start_values
+from diransac.cli.commands import grouped
 from diransac.cli.flight_options import FlightPicture
-from diransac.cli.group import grouped
 from diransac.cli.options import (
     FixedParameters,
     JsonFlag,
@@ -63,7 +63,7 @@ class TrackerOptions:
 
     def model_of(self, whole: Model, start: Result | dict[str, float] | None) -> Model:
         """The model without the parameters that are known, by option or in the result with which it starts."""
-        known = KnownParameters.of(whole, fixed_parameters("--fix", self.fixed or ()), None).fixed
+        known = KnownParameters.of(whole, fixed_parameters(self.fixed), None).fixed
         of_start = {n: start.parameters[n] for n in start.fixed} if isinstance(start, Result) else {}
         return whole.with_fixed({**of_start, **known})
 
@@ -79,14 +79,14 @@ class TrackerOptions:
 
     def start_file(self) -> Path | None:
         """The result that is the start, where one is named."""
-        return Path(self.rough) if self.rough is not None and self.rough.endswith(".json") else None
+        return Path(self.rough) if self.rough is not None and is_result(self.rough) else None
 
     def start(self, model: str) -> Result | dict[str, float] | None:
         """Start of the tracker."""
         file = self.start_file()
-        if file is None and self.rough is None and model.endswith(".json"):
+        if file is None and self.rough is None and is_result(model):
             file = Path(model)
-        return start_values("--start", self.rough) if file is None else Result.load(file)
+        return start_values(self.rough) if file is None else Result.load(file)
 
 
 @app.command("track")
@@ -121,7 +121,6 @@ def _track(
     start, like = options.start(model), preparation_of(model)
     machine, arguments = options.model_of(robot.load(model), start), options.arguments(start)
     history = History(machine)
-    shown = _Shown(history, json_lines=json_lines)
     with staged([plot, report, None if follow else output], read) as (picture, page, written), ExitStack() as opened:
         findings = list[str]()
         if follow:
@@ -132,7 +131,7 @@ def _track(
             estimates = track(machine, preparation.read(file, like), **arguments)
         table = opened.enter_context(TrackTable(written, machine)) if output else None
         with suppress(KeyboardInterrupt) if follow else ExitStack():
-            shown.run(estimates, table)
+            _show(estimates, history, table, json_lines=json_lines)
         _finish(history, picture if plot else None, page if report else None)
         if not json_lines:
             screen.show(Summary(history, findings), as_json)
@@ -165,22 +164,18 @@ def _following(
         yield now
 
 
-class _Shown:
-    """Estimates as they come: kept, written, printed, and on a terminal a line of the newest one."""
-
-    def __init__(self, history: History, *, json_lines: bool) -> None:
-        self._history, self._json_lines = history, json_lines
-
-    def run(self, estimates: Iterator[TrackedEstimate], table: TrackTable | None) -> None:
-        """Take them all."""
-        with screen.live() as line:
-            for now in estimates:
-                self._history.add(now)
-                if table is not None:
-                    table.add(now)
-                if self._json_lines:
-                    screen.emit(to_dict(now))
-                line(as_line(now, self._history.model))
+def _show(
+    estimates: Iterator[TrackedEstimate], history: History, table: TrackTable | None, *, json_lines: bool
+) -> None:
+    """Keep, write and print estimates as they come, on a terminal as a line of the newest one."""
+    with screen.live() as line:
+        for now in estimates:
+            history.add(now)
+            if table is not None:
+                table.add(now)
+            if json_lines:
+                screen.emit(to_dict(now))
+            line(as_line(now, history.model))
 
 
 def _finish(history: History, picture: Path | None, page: Path | None) -> None:
