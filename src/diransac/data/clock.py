@@ -20,26 +20,26 @@ from diransac.errors import LogError
 
 
 @dataclass(frozen=True)
-class Gridded:
-    """Columns on a uniform grid.
+class Aligned:
+    """Columns on one clock.
 
     Parameters
     ----------
     time : (n,) array
     signals : mapping of str to (n,) array
         NaN where no row belongs to a sample.
-    recorded : (n,) bool array
-        Samples that have a row.
-    step : dict, optional
-        Of the history; None where the time was even.
+    recorded : (n,) bool array, optional
+        Samples that have a row; None: all.
+    steps : tuple of dict
+        Of the history; empty where the time was even.
     notes : tuple of str
-        A sentence on what was done, if anything was.
+        Sentences on what was done, if anything was.
     """
 
     time: FloatArray
     signals: Mapping[str, FloatArray]
-    recorded: BoolArray
-    step: dict[str, Any] | None = None
+    recorded: BoolArray | None = None
+    steps: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -68,7 +68,7 @@ def _are_many(n_repeated: int, n: int) -> bool:
     return n_repeated > max(1.0, 0.01 * n)
 
 
-def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Gridded:
+def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Aligned:
     """Columns of a log on the uniform grid on which it was sampled; as they are where the time is even.
 
     Parameters
@@ -84,7 +84,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
         There is no such grid: as `in_order`; or intervals have any length.
     """
     if is_even(time):
-        return Gridded(time, signals, np.ones(len(time), bool))
+        return Aligned(time, signals)
     rows: IntArray = np.arange(len(time))[in_order(time, source)]
     dt = float(np.median(np.diff(time[rows])))
     with np.errstate(over="ignore"):
@@ -112,7 +112,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     step = {"step": "grid", "rate": 1.0 / dt, "rows": [len(time), n], "missing": int((~recorded).sum())}
     step |= {"repeated": n_repeated, "swapped": int((np.diff(time) < 0.0).sum())}
     said = _sentence(step, time[rows], at, float(np.quantile(np.abs(off), 0.95)))
-    return Gridded(grid, on_grid, recorded, step, (said,))
+    return Aligned(grid, on_grid, recorded, (step,), (said,))
 
 
 def is_even(time: FloatArray) -> bool:

@@ -187,8 +187,7 @@ class Log:
         if any(len(x) != len(stamps) for x in signals.values()):
             return cls(stamps, signals, units, source)  # which raises
         found = on_own_grid(stamps, signals, source)
-        history = () if found.step is None else (found.step,)
-        log = cls(found.time, found.signals, units, source, history, unusable=unusable or {})
+        log = cls(found.time, found.signals, units, source, found.steps, unusable=unusable or {})
         notes = (*found.notes, *checks.check_clock(log.time, source), *log.findings(found.recorded))
         return replace(log, notes=notes)
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import is_implausible
+from diransac.data.clock import Aligned
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
@@ -281,17 +282,15 @@ def resample(log: Log, rate: float | str = "median") -> Log:
     There is no anti-aliasing filter: at a lower rate, components above half of it are folded to lower frequencies, and
     a note says so.
     """
-    time, signals, step, notes = resample_columns(log.time, log.signals, rate, log.source)
-    return log.with_step(step, time=time, signals=signals, notes=notes)
+    made = resampled(log.time, log.signals, rate, log.source)
+    return log.with_step(made.steps[0], time=made.time, signals=made.signals, notes=made.notes)
 
 
-def resample_columns(
-    time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str
-) -> tuple[FloatArray, dict[str, FloatArray], dict[str, Any], list[str]]:
-    """Time, columns, step of the history and notes at a uniform rate; ``time`` (N,) increases."""
+def resampled(time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str) -> Aligned:
+    """Columns at a uniform rate; ``time`` (N,) increases."""
     grid, hertz = resampling_grid(time, rate, source)
     step, notes = describe_resampling(time, grid, hertz)
-    return grid, interpolate_at(time, signals, grid, hertz), step, notes
+    return Aligned(grid, interpolate_at(time, signals, grid, hertz), steps=(step,), notes=tuple(notes))
 
 
 def describe_resampling(time: FloatArray, grid: FloatArray, hertz: float) -> tuple[dict[str, Any], list[str]]:

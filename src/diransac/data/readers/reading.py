@@ -13,9 +13,9 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import check_clock, check_names
-from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
+from diransac.data.clock import Aligned, in_order, is_even, on_own_grid, runs_freely
 from diransac.data.log import Log
-from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
+from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resampled
 from diransac.data.readers.recording import Recording, Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, seconds, time_column, unit_of_name
@@ -232,43 +232,34 @@ def _log(table: Table, scale: Mapping[str, float], resample: float | str | None,
         units = {name: table.units[name] for name in factors if name in table.units}
         history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
     ordered = repairs.ordered(Samples(time, signals), "")
-    time, signals = ordered.time, dict(ordered.columns)
-    rows = in_order(time, source)
+    stamps = ordered.time[in_order(ordered.time, source)]
     unstated = "t" not in factors and "t" not in table.units and not table.is_described
-    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
-    gridded, resample = _gridded(time, signals, resample, repairs, source)
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(stamps, source, in_file=unstated)]
+    made = _on_even_clock(ordered, resample, repairs, source)
     if repairs.step is not None:
         history.append(repairs.step)
         notes += repairs.notes
-    if gridded is not None:
-        time, signals, recorded = gridded.time, dict(gridded.signals), gridded.recorded
-        history += [] if gridded.step is None else [gridded.step]
-        notes += gridded.notes
-    elif resample is not None:
-        columns = {name: x[rows] for name, x in signals.items()}
-        time, signals, step, said = resample_columns(time[rows], columns, resample, source)
-        history.append(step)
-        recorded, notes = np.ones(len(time), bool), [*notes, *said]
     units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
-    log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
-    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings(recorded)))))
+    history += made.steps
+    log = Log(made.time, made.signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
+    return replace(log, notes=tuple(dict.fromkeys((*notes, *made.notes, *log.findings(made.recorded)))))
 
 
-def _gridded(
-    time: FloatArray, signals: Mapping[str, FloatArray], resample: float | str | None, repairs: Repairs, source: str
-) -> tuple[Gridded | None, float | str | None]:
-    """Columns on the log's own grid, or the rate at which they are resampled.  Raises LogError: neither is known."""
-    if resample is not None:
-        return None, resample
-    if "clock" in repairs and not is_even(time):
+def _on_even_clock(samples: Samples, resample: float | str | None, repairs: Repairs, source: str) -> Aligned:
+    """Columns on the log's own grid, or resampled.  Raises LogError: they have no grid, and no rate is known."""
+    time = samples.time
+    if resample is None and "clock" in repairs and not is_even(time):
         repairs.record("clock", "the clock is uneven")
-        return None, "median"
-    try:
-        return on_own_grid(time, signals, source), None
-    except LogError:
-        if not runs_freely(time[in_order(time, source)]):
-            raise
-    return None, "median"
+        resample = "median"
+    if resample is None:
+        try:
+            return on_own_grid(time, samples.columns, source)
+        except LogError:
+            if not runs_freely(time[in_order(time, source)]):
+                raise
+        resample = "median"
+    rows = in_order(time, source)
+    return resampled(time[rows], {name: x[rows] for name, x in samples.columns.items()}, resample, source)
 
 
 def _with_clock(table: Table, rate: float | None, source: str) -> Table:

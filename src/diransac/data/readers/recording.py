@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.checks import check_time_order
+from diransac.data.clock import Aligned
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
 from diransac.text_table import some
@@ -159,16 +160,6 @@ def _together(whole: str, kind: str, parts: list[str]) -> str:
 # ---------------------------------------------------------------------- one clock
 
 
-@dataclass(frozen=True)
-class Aligned:
-    """Signals of several clocks on one: time (N,), signals (N,), what was done, and sentences about it."""
-
-    time: FloatArray
-    signals: dict[str, FloatArray]
-    step: dict[str, Any] | None
-    notes: list[str]
-
-
 def align(parts: Mapping[str, Samples], rate: float | str | None, source: str) -> Aligned:
     """Signals of several topics on the clock of one; no sample is invented.
 
@@ -201,17 +192,18 @@ def align(parts: Mapping[str, Samples], rate: float | str | None, source: str) -
     reference = parts[fastest]
     signals: dict[str, FloatArray] = {}
     if rate is None:
-        time, step, hertz = reference.time, None, None
+        time, steps, hertz = reference.time, list[dict[str, Any]](), None
         notes = [f'rows are those of topic "{fastest}"']
     else:
         time, hertz = resampling_grid(reference.time, rate, source)
         step, notes = describe_resampling(reference.time, time, hertz)
+        steps = [step]
         notes.insert(0, ", ".join(f'"{topic}" at {1.0 / x.interval:.4g} Hz' for topic, x in parts.items()))
     for topic, samples in parts.items():
         columns, said = _on_rows(samples, time, hertz, topic)
         signals |= columns
         notes += said
-    return Aligned(time, signals, step, notes)
+    return Aligned(time, signals, steps=tuple(steps), notes=tuple(notes))
 
 
 def _on_rows(

@@ -100,12 +100,11 @@ def table_of_topics(
     step |= {"log": {name: information[name] for name in kept if name in information}} if information else {}
     flags = {} if mapping is None else _flags(recording, mapping, made.time)
     step |= {"events": list(flags)} if flags else {}
-    history = (step,) if made.step is None else (step, made.step)
     said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
     unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
-    return Table({"t": made.time, **made.signals, **unusable, **flags}, units | {"t": "s"}, said, history), None if len(
-        parts
-    ) > 1 else resample
+    columns: dict[str, FloatArray | str] = {"t": made.time, **made.signals, **unusable, **flags}
+    table = Table(columns, units | {"t": "s"}, said, (step, *made.steps))
+    return table, None if len(parts) > 1 else resample
 
 
 def entries_of(
