@@ -197,7 +197,7 @@ def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) ->
         check_unique([*columns, *table.columns], source)
         columns |= table.columns
         units |= table.units
-        rows[name] = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
+        rows[name] = table.n_rows
     if len(set(rows.values())) > 1:
         raise LogError(
             f"{source}: its files have different numbers of rows: {', '.join(f'{n} {k}' for n, k in rows.items())}"

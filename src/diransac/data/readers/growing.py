@@ -245,7 +245,7 @@ class GrowingCsv(Growing):
             return False
         self._head, self._waiting, self._has_head = self._waiting[:n], self._waiting[n:], True
         (first,) = self._tables(self._waiting[:1])
-        self._numeric = {name for name, x in first.columns.items() if not isinstance(x, str)}
+        self._numeric = set(first.numbers)
         return True
 
     def _complete_rows(self) -> list[str]:

@@ -270,8 +270,7 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
         raise SettingsError(f"the rate of a log without time is {rate}; give Hz")
     if "t" in table.columns:
         raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
-    n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
+    columns: dict[str, FloatArray | str] = {"t": np.arange(table.n_rows) / rate, **table.columns}
     clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
     return clocked.with_step({"step": "clock", "rate": float(rate)})
 
@@ -300,9 +299,8 @@ def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
 
 def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Columns that are as long as the time, and for the others the reason why they are no signals."""
-    columns = {name: column for name, column in table.columns.items() if name != "t"}
-    check_names(columns, source)
-    unusable = {name: column for name, column in columns.items() if isinstance(column, str)}
-    numbers = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    check_names([name for name in table.columns if name != "t"], source)
+    unusable = {name: column for name, column in table.columns.items() if isinstance(column, str)}
+    numbers = {name: x for name, x in table.numbers.items() if name != "t"}
     unusable |= {m: f"has {len(x)} value{'s' * (len(x) != 1)}, the time {n}" for m, x in numbers.items() if len(x) != n}
     return {name: x for name, x in numbers.items() if len(x) == n}, unusable

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
@@ -89,6 +88,16 @@ class Table:
     is_described: bool = False
     times: Mapping[str, FloatArray] = field(default_factory=dict)
     elements: tuple[str, ...] = ()
+
+    @property
+    def numbers(self) -> dict[str, FloatArray]:
+        """Columns that hold numbers."""
+        return {name: x for name, x in self.columns.items() if not isinstance(x, str)}
+
+    @property
+    def n_rows(self) -> int:
+        """Length of the longest column of numbers."""
+        return max(map(len, self.numbers.values()), default=0)
 
     def with_step(self, step: Mapping[str, Any]) -> Table:
         """The table with one more step in its history."""
@@ -215,8 +224,7 @@ def time_column(table: Table, taken: Container[str]) -> str | None:
     """
     if "t" in table.columns:
         return None
-    numeric = [name for name, x in table.columns.items() if isinstance(x, np.ndarray)]
-    for kind in (numeric, table.times):
+    for kind in (table.numbers, table.times):
         found = [name for name in kind if _NAME.fullmatch(name) and name not in taken]
         if found:
             return found[0] if len(found) == 1 else None

@@ -40,15 +40,15 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
     entries, notes = mapping.chosen({"": list(columns)}, {"": table.elements}, source)
     mapped: dict[str, FloatArray | str] = {"t": columns["t"]} if "t" in columns else {}
     units = {"t": "s"} if mapping.time_column is not None else {n: x for n, x in table.units.items() if n == "t"}
+    numbers = {name: x for name, x in columns.items() if not isinstance(x, str)}
     for entry in entries:
-        texts = {name: columns[name] for name in entry.needs if isinstance(columns[name], str)}
-        for name, why in texts.items():
-            raise LogError(f'{source}: column "{name}" {why}')
-        mapped |= entry.apply({name: x for name, x in columns.items() if not isinstance(x, str)})
+        for name in entry.needs:
+            if name not in numbers:
+                raise LogError(f'{source}: column "{name}" {columns[name]}')
+        mapped |= entry.apply(numbers)
         units |= entry.known_units()
-    numeric = {name: x for name, x in columns.items() if not isinstance(x, str)}
-    events = [x for x in mapping.events_in({"": list(numeric)}) if not x.topic]
-    mapped |= {x.name: x.flags(numeric) for x in events}
+    events = [x for x in mapping.events_in({"": list(numbers)}) if not x.topic]
+    mapped |= {x.name: x.flags(numbers) for x in events}
     step = {"step": "map", "mapping": mapping.source, "text": mapping.text, "signals": _origins(entries)}
     step |= {"events": [x.name for x in events]} if events else {}
     made = replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), filter=None)
