@@ -303,7 +303,7 @@ class Log:
         LogError
             Fewer than 2 rows lie there.
         """
-        slack = 1e-6 * self.dt  # rounding
+        slack = checks.ROUNDING * self.dt
         first, last = np.searchsorted(self.time, [start - slack, end + slack])
         if last - first < 2:
             raise LogError(

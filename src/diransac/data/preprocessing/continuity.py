@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.data.checks import ROUNDING
 from diransac.data.filters import median_filter
 from diransac.data.units import one_turn
 
@@ -101,7 +102,7 @@ def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: Floa
 def _between(values: FloatArray, left: IntArray, weight: FloatArray) -> FloatArray:
     """Linear interpolation without neighbours of zero weight."""
     mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
-    return np.where(weight < 1e-6, values[left], np.where(weight > 1.0 - 1e-6, values[left + 1], mixed))
+    return np.where(weight < ROUNDING, values[left], np.where(weight > 1.0 - ROUNDING, values[left + 1], mixed))
 
 
 def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
-from diransac.data.checks import is_implausible
+from diransac.data.checks import ROUNDING, is_implausible
 from diransac.data.clock import Aligned
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.data.preprocessing.spikes import despike
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 Column = TypeVar("Column")
-
-_ROUNDING = 1e-6
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -323,7 +321,7 @@ def interpolate_at(
     An interval of more than three and a half median ones (and more than one new sample) is a gap.
     """
     left, weight, blank = _in_gaps(time, grid, _gaps(time, hertz))
-    slack = _ROUNDING / hertz
+    slack = ROUNDING / hertz
     blank |= (grid < time[0] - slack) | (grid > time[-1] + slack)
     return {name: np.where(blank, np.nan, x) for name, x in interpolated(signals, left, weight).items()}
 
@@ -341,7 +339,7 @@ def _in_gaps(
     """Sample before each new one, the new one's weight between the two, and whether it lies in a gap: (n,) each."""
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
     weight = np.clip((grid - time[left]) / np.diff(time)[left], 0.0, 1.0)
-    return left, weight, gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
+    return left, weight, gaps[left] & (weight > ROUNDING) & (weight < 1.0 - ROUNDING)
 
 
 def _rate(rate: float | str, usual: float) -> float:
@@ -414,7 +412,7 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
             raise SettingsError(f'the delay of "{name}" is {delay}; give seconds')
     for delay in dict.fromkeys(delays.values()):
         rows = n - delay / log.dt
-        covered &= (rows >= -_ROUNDING) & (rows <= n[-1] + _ROUNDING)
+        covered &= (rows >= -ROUNDING) & (rows <= n[-1] + ROUNDING)
         rows = np.clip(rows, 0.0, n[-1])
         left = np.minimum(rows.astype(np.intp), len(log) - 2)
         late = {name: log[name] for name, x in delays.items() if x == delay}

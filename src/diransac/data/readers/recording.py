@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
-from diransac.data.checks import check_time_order
+from diransac.data.checks import ROUNDING, check_time_order
 from diransac.data.clock import Aligned
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
@@ -222,7 +222,7 @@ def _nearest_rows(samples: Samples, time: FloatArray, dt: float, topic: str) -> 
     after = np.clip(np.searchsorted(time, samples.time), 1, len(time) - 1)
     row = np.where(samples.time - time[after - 1] <= time[after] - samples.time, after - 1, after)
     moved = np.abs(time[row] - samples.time)
-    inside = moved <= dt * (0.5 + 1e-6)
+    inside = moved <= dt * (0.5 + ROUNDING)
     order = np.lexsort((moved, row))
     first = order[np.r_[True, np.diff(row[order]) > 0]]
     kept = np.sort(first[inside[first]])
