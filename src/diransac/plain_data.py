@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from diransac.errors import SettingsError
-from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
+from diransac.limits import LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
 
 
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
@@ -55,10 +55,10 @@ def json_data(text: str | bytes) -> Any:
 def _check_depth(found: object) -> None:
     """Raises ValueError: lists and mappings are nested so deeply that what walks over them may not."""
     level: list[Any] = [found]
-    depth = 0
+    depth, most = 0, 100
     while level:
-        if (depth := depth + 1) > DEEPEST:
-            raise ValueError(f"it is nested too deeply: it has {beyond(DEEPEST, 'levels')}")
+        if (depth := depth + 1) > most:
+            raise ValueError(f"it is nested too deeply: it has {beyond(most, 'levels')}")
         inner = (x.values() if type(x) is dict else x for x in level if type(x) in (dict, list))
         level = [y for x in inner for y in x if type(y) in (dict, list)]
 
