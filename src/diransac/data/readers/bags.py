@@ -22,10 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
-from diransac.data.readers.table import DAMAGE, undamaged
+from diransac.data.readers.table import DAMAGE, installed, undamaged
 from diransac.errors import LogError
 
-INSTALL = 'install them with pip install "diransac[logs]"'
 LARGEST_CHUNK, MAGIC = 1 << 29, b"\x89MCAP0\r\n"
 """Bytes of a chunk at most; what stands at the start and at the end of an MCAP file."""
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
@@ -254,12 +253,9 @@ class McapFile:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        try:
+        with installed(f"{source}: MCAP needs the packages mcap and rosbags"):
+            import rosbags.typesys  # noqa: F401  # which decodes messages
             from mcap.reader import make_reader
-            from rosbags.typesys import get_typestore
-        except ImportError as error:
-            raise LogError(f"{source}: MCAP needs the packages mcap and rosbags; {INSTALL}") from error
-        del get_typestore
         self.notes: list[str] = []
         self.topics: Collection[str] | None = None
         self._path, self._source = path, source
@@ -405,11 +401,9 @@ class RosBag:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        try:
+        with installed(f"{source}: bags need the package rosbags"):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise LogError(f"{source}: bags need the package rosbags; {INSTALL}") from error
         self.notes: list[str] = []
         self._source = source
         self._open = partial(AnyReader, [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -44,6 +44,15 @@ def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterat
 
 
 @contextmanager
+def installed(what: str) -> Iterator[None]:
+    """Context of imports from packages of the extra logs.  Raises LogError: one is missing; ``what`` needs it."""
+    try:
+        yield
+    except ImportError as error:
+        raise LogError(f'{what}; pip install "diransac[logs]"') from error
+
+
+@contextmanager
 def readable(source: str) -> Iterator[None]:
     """Context in which a file is opened and read.  Raises LogError: there is none, it is too large, or unreadable."""
     try:
