@@ -222,6 +222,11 @@ def check_even(time: FloatArray, source: str) -> None:
     )
 
 
+def are_many(n_bad: int, n: int) -> bool:
+    """True for more than 1 in 100, and more than one, of ``n`` rows, lines or fields: these are not left out."""
+    return n_bad > max(1, n // 100)
+
+
 def is_implausible(n_new: float, n: int) -> bool:
     """True for a number of new rows of ``n`` old ones that only a damaged time leads to."""
     return not n_new <= max(100_000, 1000 * n)

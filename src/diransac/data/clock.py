@@ -58,14 +58,9 @@ def in_order(time: FloatArray, source: str) -> IntArray | slice:
     rows = np.argsort(time, kind="stable")
     rows = rows[np.r_[True, np.diff(time[rows]) > 0.0]]
     usual = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 0.0
-    if len(rows) < 2 or shortest < -3.5 * usual or _are_many(n - len(rows), n):
+    if len(rows) < 2 or shortest < -3.5 * usual or checks.are_many(n - len(rows), n):
         checks.check_time_order(time, source)
     return rows
-
-
-def _are_many(n_repeated: int, n: int) -> bool:
-    """True where more than a few of ``n`` rows have no sample of their own."""
-    return n_repeated > max(1.0, 0.01 * n)
 
 
 def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Aligned:
@@ -98,7 +93,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     n_repeated = len(time) - int(kept.sum())
     # Jitter may be a third of a sample; the phase of the grid is uncertain by the rest.
     is_grid = (np.abs(off) > 0.4).mean() <= 0.02 and n_gaps <= 0.25 * len(rows)
-    if not is_grid or _are_many(n_repeated, len(time)):
+    if not is_grid or checks.are_many(n_repeated, len(time)):
         checks.check_even(time[rows], source)
         raise LogError(f"{source}: {n_repeated} of {len(time)} rows repeat a time; remove them")
     rows, at = rows[kept], places[kept]
