@@ -20,7 +20,7 @@ from diransac.arrays import FloatArray
 from diransac.data.mapping import MappedSignals
 from diransac.data.readers.bags import LARGEST_CHUNK, MAGIC, BagRecording, McapFile, damages, unpacked
 from diransac.data.readers.comma_separated import fields_of, head_of, read_csv
-from diransac.data.readers.recording import Samples
+from diransac.data.readers.recording import Samples, nearest
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, readable, undamaged
 from diransac.data.readers.topics import entries_of, is_one_table, signals_of, wanted_by
@@ -424,11 +424,9 @@ class GrowingMcap(Growing):
 
     def _placed(self, samples: Samples, apart: float) -> Samples:
         """Samples at the nearest stamp of the fastest topic, where one is near."""
-        after = np.clip(np.searchsorted(self._stamps, samples.time), 1, len(self._stamps) - 1)
-        before, behind = self._stamps[after - 1], self._stamps[after]
-        nearest = np.where(samples.time - before <= behind - samples.time, before, behind)
-        near = np.abs(nearest - samples.time) <= 0.5 * apart
-        return Samples(np.where(near, nearest, samples.time), samples.columns)
+        stamps = self._stamps[nearest(self._stamps, samples.time)]
+        near = np.abs(stamps - samples.time) <= 0.5 * apart
+        return Samples(np.where(near, stamps, samples.time), samples.columns)
 
 
 def _joined(before: Samples, samples: Samples) -> Samples:

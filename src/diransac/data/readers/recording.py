@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, IntArray
 from diransac.data.checks import ROUNDING, check_time_order
 from diransac.data.clock import Aligned
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
@@ -217,10 +217,15 @@ def _on_rows(
     return _nearest_rows(samples, time, float(np.median(np.diff(time))), topic)
 
 
+def nearest(time: FloatArray, stamps: FloatArray) -> IntArray:
+    """Index (n,) of the nearest of two or more ascending times for each stamp; of two that are as near, the first."""
+    after = np.clip(np.searchsorted(time, stamps), 1, len(time) - 1)
+    return np.where(stamps - time[after - 1] <= time[after] - stamps, after - 1, after)
+
+
 def _nearest_rows(samples: Samples, time: FloatArray, dt: float, topic: str) -> tuple[dict[str, FloatArray], list[str]]:
     """Columns with each sample in the nearest row; of two samples of one row, the nearer; NaN elsewhere."""
-    after = np.clip(np.searchsorted(time, samples.time), 1, len(time) - 1)
-    row = np.where(samples.time - time[after - 1] <= time[after] - samples.time, after - 1, after)
+    row = nearest(time, samples.time)
     moved = np.abs(time[row] - samples.time)
     inside = moved <= dt * (0.5 + ROUNDING)
     order = np.lexsort((moved, row))
