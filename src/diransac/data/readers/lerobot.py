@@ -25,7 +25,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.readers.parquet import is_numeric, numbers_of, scanned
-from diransac.data.readers.table import Table, check_size, check_unique
+from diransac.data.readers.table import Table, check_size, check_unique, readable
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, LARGEST_TABLE, MOST_COUNTED, beyond, read_bytes
 from diransac.plain_data import json_data, read_text
@@ -162,13 +162,8 @@ class LerobotDataset:
     def _content(self, file: Path) -> bytes:
         """Bytes of a file; those of the last one are kept."""
         if self._last is None or self._last[0] != file:
-            named = f'{self.source}: "{self._inside(file).relative_to(self.folder)}"'
-            try:
+            with readable(f'{self.source}: "{self._inside(file).relative_to(self.folder)}"'):
                 self._last = file, read_bytes(file, LARGEST_LOG)
-            except ValueError as error:
-                raise LogError(f"{named}: {error}; split it") from error
-            except OSError as error:
-                raise LogError(f"{named} cannot be read: {error.strerror}") from error
         return self._last[1]
 
     def _episodes_in(self, file: Path) -> list[int]:
