@@ -267,16 +267,14 @@ def list_topics(recording: Recording) -> TopicTable:
     """Topics of a recording, with their rates and gaps."""
     fields = recording.fields
     read = recording.read(dict.fromkeys(fields, ()), "message")
-    topics = {
-        name: replace(_facts(read[name].time, fields[name]), texts=recording.texts.get(name, ())) for name in fields
-    }
+    topics = {name: _facts(read[name].time, own, recording.texts.get(name, ())) for name, own in fields.items()}
     return TopicTable(recording.source, topics, recording.notes, recording.metadata, recording.elements)
 
 
-def _facts(time: FloatArray, fields: tuple[str, ...]) -> TopicFacts:
+def _facts(time: FloatArray, fields: tuple[str, ...], texts: tuple[str, ...]) -> TopicFacts:
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
     n_gaps = int((steps > 3.5 * usual).sum()) if usual > 0.0 else 0
     longest = float(steps.max()) if len(steps) else np.nan
     rate = 1.0 / usual if usual > 0.0 else np.nan
-    return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields)
+    return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields, texts)
