@@ -164,8 +164,6 @@ class UlogRecording(Recording):
         name = content[3:].decode()
         if number in self._subscriptions:
             return
-        if name not in self._formats:
-            raise ValueError(name)
         layout, size = self._layout(name)
         names = list(layout)
         while names and names[-1].startswith("_padding"):  # trailing padding is not written
@@ -177,18 +175,19 @@ class UlogRecording(Recording):
 
     def _layout(self, name: str, depth: int = 0) -> tuple[dict[str, tuple[str, int]], int]:
         """Type and offset of every field of a format, nested ones by dotted names, and the size of a record."""
+        if name not in self._formats or depth > 8:
+            raise ValueError("there is no such format, or formats contain each other")
         layout: dict[str, tuple[str, int]] = {}
         size = 0
-        if depth > 8:
-            raise ValueError("formats contain each other")
         for text in filter(None, self._formats[name].split(";")):
             match = re.fullmatch(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", text)
             if match is None:
                 raise ValueError(text)
             kind, count, label = match.groups()
-            inner, step = (
-                ({"": (_TYPES[kind], 0)}, int(_TYPES[kind][2])) if kind in _TYPES else self._inner(kind, depth)
-            )
+            if kind in _TYPES:
+                inner, step = {"": (_TYPES[kind], 0)}, int(_TYPES[kind][2])
+            else:
+                inner, step = self._layout(kind, depth + 1)
             repeats = int(count or 1)
             if size + repeats * step > _LARGEST_RECORD or repeats * len(inner) > _LARGEST_RECORD:
                 raise ValueError("a record is too large")
@@ -198,11 +197,6 @@ class UlogRecording(Recording):
                     layout[f"{prefix}.{rest}" if rest else prefix] = (code, size + offset)
                 size += step
         return layout, size
-
-    def _inner(self, kind: str, depth: int) -> tuple[dict[str, tuple[str, int]], int]:
-        if kind not in self._formats:
-            raise ValueError(kind)
-        return self._layout(kind, depth + 1)
 
     def _take_information(self, content: bytes) -> None:
         kind, name, value = _keyed(content)
@@ -219,9 +213,6 @@ class UlogRecording(Recording):
         (stamp,) = struct.unpack_from("<Q", content, at)
         if len(self.metadata["messages"]) < _MOST_TEXTS:
             self.metadata["messages"].append([stamp / 1e6, content[at + 8 :].decode(errors="replace")])
-
-    def _take_tagged_text(self, content: bytes) -> None:
-        self._take_text(content, 3)
 
     def _take_dropout(self, content: bytes) -> None:
         self.metadata["dropouts"].append(struct.unpack("<H", content)[0] / 1e3)
@@ -300,6 +291,6 @@ _TAKERS = {
     ord("I"): UlogRecording._take_information,
     ord("P"): UlogRecording._take_parameter,
     ord("L"): UlogRecording._take_text,
-    ord("C"): UlogRecording._take_tagged_text,
+    ord("C"): lambda log, content: log._take_text(content, 3),  # which has a tag
     ord("O"): UlogRecording._take_dropout,
 }
