@@ -122,8 +122,7 @@ def one_turn(unit: str) -> float | None:
 
 def _factor(a: _Unit, b: _Unit) -> float | None:
     """The factor between two units of one dimension."""
-    kinds = {n for n in ("rad", "cycle") if n in a.powers} | {n for n in ("rad", "cycle") if n in b.powers}
-    if a.dimension != b.dimension or len(kinds) == 2:
+    if a.dimension != b.dimension or {"rad", "cycle"} <= {*a.powers, *b.powers}:
         return None
     return a.factor / b.factor
 

@@ -96,7 +96,7 @@ class LerobotDataset:
             counters = (_INDEX, "frame_index", "index", "task_index")
             kinds = {name: kind for name, kind in schema.items() if name not in counters}
             read = [name for name, kind in kinds.items() if is_numeric(kind) or self._is_vector(name, kind)]
-            counted = [name for name in ("frame_index",) if name in schema and is_numeric(schema[name])]
+            counted = ["frame_index"] if "frame_index" in schema and is_numeric(schema["frame_index"]) else []
             if _FILE.fullmatch(self.files[episode].name):
                 import polars as pl
 
@@ -108,7 +108,7 @@ class LerobotDataset:
             vectors = {
                 name: width if isinstance(width, str) else _matrix(frame[name], width) for name, width in widths.items()
             }
-            counts = numbers_of(frame[counted[0]]) if counted else np.arange(float(len(frame)))
+            counts = numbers_of(frame["frame_index"]) if counted else np.arange(float(len(frame)))
         left = {name: f"holds no short lists of numbers ({kinds[name]!s:.40})" for name in kinds if name not in read}
         pieces = [piece for name, values in vectors.items() for piece in self._columns(name, values)]
         columns: dict[str, FloatArray | str] = {name: values for name, values in pieces if name != "timestamp"}
