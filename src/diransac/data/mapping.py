@@ -234,7 +234,7 @@ class LogMapping:
             An entry that is not optional has no topic or field; no entry has.
         """
         found: dict[str, MappedSignals] = {}
-        lacking: dict[str, str] = {}
+        lacking: dict[str, tuple[str, bool]] = {}
         only = next(iter(fields)) if len(fields) == 1 else ""
         for entry in [one for whole in self.signals for one in _of_elements(whole, elements.get(whole.topic or only))]:
             topic = entry.topic or only
@@ -244,13 +244,11 @@ class LogMapping:
                     found.setdefault(name, replace(entry, topic=topic))
             else:
                 for name in entry.names:
-                    lacking.setdefault(name, why if entry.optional else f"!{why}")
-        absent = {name: why for name, why in lacking.items() if name not in found}
+                    lacking.setdefault(name, (why, entry.optional))
+        absent = {name: why for name, (why, _) in lacking.items() if name not in found}
         for name, why in absent.items():
-            if why.startswith("!"):
-                raise LogError(
-                    f'{source}: {self.source} has "{name}" from {why[1:]}; remove it, or say optional = true'
-                )
+            if not lacking[name][1]:
+                raise LogError(f'{source}: {self.source} has "{name}" from {why}; remove it, or say optional = true')
         if not found:
             what, there = ("columns", fields[""]) if set(fields) == {""} else ("topics", list(fields))
             raise LogError(f"{source}: {self.source} fits none of its {what}; found {some(there)}")
