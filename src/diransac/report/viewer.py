@@ -23,11 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, runs
 from diransac.atomic import write_with
 from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
-from diransac.data.segment import runs
 from diransac.errors import ResultError
 from diransac.identification.result import Result
 from diransac.plain_text import one_line

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, runs
 from diransac.data.checks import ROUNDING, is_implausible
 from diransac.data.clock import Aligned
 from diransac.data.preprocessing.continuity import interpolated
@@ -210,8 +210,7 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     rows = np.flatnonzero(kept)
     part, inside = log[int(rows[0]) : int(rows[-1]) + 1], kept[rows[0] : rows[-1] + 1]
     signals = {n: x if n in events else np.where(inside, x, np.nan) for n, x in part.signals.items()}
-    edges = np.flatnonzero(np.diff(np.r_[True, kept, True].astype(int)))
-    stretches = [[float(log.time[a]), float(log.time[b - 1])] for a, b in edges.reshape(-1, 2)]
+    stretches = [[float(log.time[x.start]), float(log.time[x.stop - 1])] for x in runs(~kept)]
     step |= {"left_out": stretches}
     if not stretches:
         return log.with_step(step)
