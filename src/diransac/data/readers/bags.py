@@ -113,8 +113,7 @@ class BagRecording(Recording):
     def _samples(self, topic: str, found: _Columns, origin: int) -> Samples:
         for label, values in found.values.items():
             if label in found.missing and label not in found.texts and np.isnan(np.frombuffer(values)).all():
-                known = ", ".join(self._fields[topic])
-                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {known}')
+                raise self.lacking(topic, label)
         times = np.frombuffer(found.stamps if found.is_stamped else found.times, dtype=np.int64)
         columns = {label: np.frombuffer(x, dtype=np.float64) for label, x in found.values.items()}
         texts = {label: np.array(x, dtype=np.object_) for label, x in found.texts.items()}

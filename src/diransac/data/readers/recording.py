@@ -98,8 +98,13 @@ class Recording:
             raise LogError(f'{self.source}: there is no topic "{topic}"; found {", ".join(self.fields)}')
         for label in fields:
             if label not in self.fields[topic]:
-                listed = ", ".join(self.fields[topic])
-                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {listed}')
+                raise self.lacking(topic, label)
+
+    def lacking(self, topic: str, label: str) -> LogError:
+        """Error of a topic that has no such field."""
+        return LogError(
+            f'{self.source}: topic "{topic}" has no field "{label}"; it has {", ".join(self.fields[topic])}'
+        )
 
 
 def seconds_since(origin: int, nanoseconds: npt.NDArray[np.int64]) -> FloatArray:
