@@ -206,9 +206,8 @@ class LerobotDataset:
 
     def _time(self, stamps: FloatArray | str | None, counts: FloatArray) -> FloatArray | None:
         """Seconds of the rows; those of the rate where stamps agree to single precision, or are missing."""
-        fps = self._info.get("fps")
-        is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and 1e-6 < fps < 1e9
-        even: FloatArray | None = counts / float(fps) if is_rate else None  # type: ignore[arg-type]
+        fps: Any = self._info.get("fps")
+        even: FloatArray | None = counts / float(fps) if type(fps) in (int, float) and 1e-6 < fps < 1e9 else None
         if not isinstance(stamps, np.ndarray) or stamps.ndim != 1:
             return even
         if even is not None and len(even) and np.abs(stamps - even).max() <= 2.0**-22 * np.abs(even).max():
