@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from diransac.errors import SettingsError
 from diransac.limits import LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
+from diransac.plain_text import literal
 
 
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
@@ -93,6 +94,15 @@ def toml_table(text: str) -> dict[str, Any]:
         found = tomllib.loads(text)
     _check_depth(found)
     return found
+
+
+def toml_text(value: object) -> str:
+    """A text, a number, a flag or a list of them in TOML."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml_text, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return literal(value) if isinstance(value, str) else repr(value)
 
 
 def toml_file(path: Path, what: str) -> dict[str, Any]:
