@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -199,12 +199,12 @@ class LogMapping:
     time: str = "header"
     time_column: str | None = None
     time_scale: float = 1.0
-    preparation: Mapping[str, Any] | None = None
+    preparation: Mapping[str, Any] = field(default_factory=dict)
     text: str = ""
 
     def option(self, name: str) -> Any:
         """A step of the preparation, or None."""
-        return (self.preparation or {}).get(name)
+        return self.preparation.get(name)
 
     def events_in(self, fields: Mapping[str, Sequence[str]]) -> list[Event]:
         """Events whose topic and fields a log has."""

@@ -219,7 +219,7 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     return part.with_step(step, notes=[note], signals=signals)
 
 
-def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
+def prepared(log: Log, steps: Mapping[str, Any]) -> Log:
     """Log after steps that need no model, by the keys of a mapping file; others are not done.
 
     Parameters
@@ -234,7 +234,7 @@ def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
     LogError, SettingsError
         As each step.
     """
-    found = {name: x for name, x in (steps or {}).items() if x is not None}
+    found = {name: x for name, x in steps.items() if x is not None}
     named = {name: [x] if isinstance(x, str) else x for name, x in found.items() if name in ("while", "despike")}
     if "from" in found or "until" in found:
         log = log.between(found.get("from", -math.inf), found.get("until", math.inf))

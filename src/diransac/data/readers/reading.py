@@ -106,7 +106,7 @@ class Reading:
         if unmeasured:
             table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
         log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
-        log = preprocessing.prepared(log, {} if mapping is None else mapping.preparation)
+        log = log if mapping is None else preprocessing.prepared(log, mapping.preparation)
         spiky = [name for name in earlier.despike if name in log]
         delays = {name: x for name, x in earlier.shift.items() if name in log}
         return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
