@@ -20,7 +20,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.checks import ROUNDING
-from diransac.data.filters import median_filter
+from diransac.data.filters import median_filter, mirrored_windows
 from diransac.data.units import one_turn
 
 if TYPE_CHECKING:
@@ -331,9 +331,7 @@ def _with_one_sign(log: Log, names: Sequence[str]) -> Log:
 
 def _neighbours(n: int, reach: int) -> IntArray:
     """Indices ``(n, 2 reach + 1)`` of the samples about each, mirrored at both ends; fewer where there are fewer."""
-    reach = min(reach, n - 1)
-    padded = np.pad(np.arange(n), reach, mode="reflect")
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1))
+    return np.asarray(mirrored_windows(np.arange(n), min(reach, n - 1)))
 
 
 def _medoids(
