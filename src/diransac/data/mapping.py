@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import LogError
 from diransac.text_table import some
 
@@ -26,7 +26,7 @@ class Condition:
     below: float = math.inf
     equals: float | str | None = None
 
-    def holds(self, values: FloatArray | TextArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def holds(self, values: FloatArray | TextArray) -> BoolArray:
         """Flags (n,); False for NaN, and for texts where numbers are compared, or the reverse."""
         if (values.dtype == np.object_) != isinstance(self.equals, str):
             return np.zeros(len(values), np.bool_)
