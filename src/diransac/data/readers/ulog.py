@@ -97,7 +97,7 @@ class UlogRecording(Recording):
                 damages += 1
                 self._doubt_last()
                 at = self._resume(at + 1)
-                if damages > 100 or at < 0:
+                if damages > 100 or at < 0:  # the rest is no ULog
                     return
                 continue
             if after > end:
@@ -127,7 +127,7 @@ class UlogRecording(Recording):
         """Place of the next mark or message that is plausible, -1 where there is none."""
         data, end = self._data, len(self._data)
         mark = data.find(b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12", at)
-        last = min(end, at + (1 << 20)) if mark < 0 else mark
+        last = min(end, at + (1 << 20)) if mark < 0 else mark  # without a mark, a megabyte is searched
         for place in range(at, last - 5):
             if data[place + 2] == ord("D"):
                 size, _ = _HEADER.unpack_from(data, place)
@@ -229,7 +229,7 @@ class UlogRecording(Recording):
         return named
 
     def _first_time(self) -> int:
-        """Start of the log in microseconds: the header's, or that of most topics if it is not the minute before."""
+        """Start of the log, µs: the header's, or that of most topics if that is not in the minute after it."""
         firsts = [int(self._column(topic, "timestamp", topic.places[:1])[0]) for topic in self._topics.values()]
         usual = sorted(firsts)[len(firsts) // 2]
         return self._start if 0 <= usual - self._start < 60_000_000 else usual
@@ -263,7 +263,7 @@ class UlogRecording(Recording):
         latest = 1 << 53
         since = np.minimum(times, np.uint64(latest)).astype(np.int64) - min(self._start, latest)
         columns = {label: as_doubles(self._column(topic, label, topic.places)) for label in fields}
-        return Samples(seconds_since(0, since * 1000), columns)
+        return Samples(seconds_since(0, 1000 * since), columns)
 
     def _column(self, topic: _Topic, label: str, places: array[int]) -> npt.NDArray[Any]:
         """One field (n,) of the records at some places."""
