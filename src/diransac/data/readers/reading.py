@@ -124,11 +124,10 @@ class Reading:
         table, _ = self._table(opened, earlier, self._chosen("columns", earlier), Repairs(), source)
         if opened.times and not table.times:
             raise LogError(f"{source}: its time is that of a calendar, which cannot be followed; give seconds")
-        factors = {**earlier._factors(table), **self.scale}
-        time, _ = seconds(table, factors, source)
+        table = table.scaled({**earlier._factors(table), **self.scale})
+        time, _ = seconds(table, source)
         signals, _ = _signals(table, len(time), source)
-        units = {n: unit for n, unit in table.units.items() if n in signals and abs(factors.get(n, 1.0)) == 1.0}
-        return {"t": time, **{n: x * factors.get(n, 1.0) for n, x in signals.items()}}, units
+        return {"t": time, **signals}, {name: unit for name, unit in table.units.items() if name in signals}
 
     def topics(self, like: Sequence[Mapping[str, Any]]) -> tuple[LogMapping | None, dict[str, str]]:
         """Mapping, and new names by ``topic.field``, of a recording."""
@@ -218,31 +217,23 @@ _ARGUMENTS: dict[str, Any] = {
 # From a table to a log ------------------------------------------------------------------------------------------------
 def _log(table: Table, scale: Mapping[str, float], resample: float | str | None, repairs: Repairs, source: str) -> Log:
     """Log of a table: scaled, repaired, resampled and checked."""
-    history: list[dict[str, Any]] = list(table.history)
-    factors = {name: float(factor) for name, factor in scale.items()}
-    for name, factor in factors.items():
-        check_factor(name, factor)
-    time, converted = seconds(table, factors, source)
+    for name, factor in scale.items():
+        check_factor(name, float(factor))
+    table = table.scaled({name: float(factor) for name, factor in scale.items()})
+    time, converted = seconds(table, source)
     signals, unusable = _signals(table, len(time), source)
-    for name in factors:
+    for name in scale:
         if name != "t" and name not in signals:
             raise LogError(f'{source}: there is no signal "{name}" to scale; found {", ".join(table.columns)}')
-    if factors:
-        signals = {n: x * factors.get(n, 1.0) for n, x in signals.items()}
-        units = {name: table.units[name] for name in factors if name in table.units}
-        history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
     ordered = repairs.ordered(Samples(time, signals), "")
     stamps = ordered.time[in_order(ordered.time, source)]
-    unstated = "t" not in factors and "t" not in table.units and not table.is_described
+    unstated = "t" not in table.units and not table.is_described
     notes = [*table.notes, *([converted] if converted else []), *check_clock(stamps, source, in_file=unstated)]
     made = _on_even_clock(ordered, resample, repairs, source)
-    if repairs.step is not None:
-        history.append(repairs.step)
-        notes += repairs.notes
-    units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
-    history += made.steps
-    log = Log(made.time, made.signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
-    return replace(log, notes=tuple(dict.fromkeys((*notes, *made.notes, *log.findings(made.recorded)))))
+    history = (*table.history, *([] if repairs.step is None else [repairs.step]), *made.steps)
+    log = Log(made.time, made.signals, table.units, source, history, unusable=unusable, filter=table.filter)
+    notes += (*repairs.notes, *made.notes, *log.findings(made.recorded))
+    return replace(log, notes=tuple(dict.fromkeys(notes)))
 
 
 def _on_even_clock(samples: Samples, resample: float | str | None, repairs: Repairs, source: str) -> Aligned:

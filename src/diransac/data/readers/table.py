@@ -112,6 +112,17 @@ class Table:
         """The table with one more step in its history."""
         return replace(self, history=(*self.history, dict(step)))
 
+    def scaled(self, factors: Mapping[str, float]) -> Table:
+        """The table with columns times factors, the time then in seconds; no unit where the magnitude changes."""
+        if not factors:
+            return self
+        columns = {**self.columns, **{name: x * factors[name] for name, x in self.numbers.items() if name in factors}}
+        before = {name: self.units[name] for name in factors if name in self.units}
+        units = {name: unit for name, unit in self.units.items() if abs(factors.get(name, 1.0)) == 1.0}
+        units |= {"t": "s"} if "t" in factors else {}
+        step = {"step": "scale", "factors": dict(factors), **({"units": before} if before else {})}
+        return replace(self, columns=columns, units=units).with_step(step)
+
     def with_time_of(self, name: str) -> Table:
         """The table in which a column with times of the calendar is seconds since the first."""
         if name not in self.times:
@@ -246,7 +257,7 @@ def unit_of_name(name: str) -> str | None:
     return _UNIT_OF_ENDING[match["unit"].lower()] if match and match["unit"] else None
 
 
-def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[FloatArray, str]:
+def seconds(table: Table, source: str) -> tuple[FloatArray, str]:
     """Column ``t`` (N,) of a table in seconds, and a sentence on a conversion from its unit, empty without one.
 
     Raises LogError: there is no such column, or it holds no numbers.
@@ -258,8 +269,6 @@ def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[Fl
     time = table.columns["t"]
     if isinstance(time, str):
         raise LogError(f'{source}: the time column "t" {time}')
-    if "t" in factors:
-        return time * factors["t"], ""
     unit = table.units.get("t", "s")
     factor = conversion(unit, "s")
     if factor in (None, 1.0):
