@@ -23,7 +23,7 @@ def test_planted_losses_are_found_exactly_whatever_jitter_and_drift(seed, jitter
     t = 17.0 + DT * (k + 0.5 * drift * k * k / N + rng.uniform(-jitter, jitter, N))
     lost = np.sort(rng.choice(np.arange(1, N - 1), 12, replace=False))
     found = gridded(np.delete(t, lost), np.delete(k, lost))
-    assert found.step["missing"] == 12
+    assert found.steps[0]["missing"] == 12
     np.testing.assert_array_equal(np.flatnonzero(~found.recorded), lost)
     np.testing.assert_array_equal(found.signals["x"][found.recorded], np.delete(k, lost))
     np.testing.assert_allclose(np.diff(found.time), found.time[1] - found.time[0], rtol=1e-6)
@@ -34,7 +34,7 @@ def test_an_even_time_is_left_as_it_is():
     t = DT * (np.arange(N) + np.random.default_rng(0).uniform(-0.05, 0.05, N))
     found = gridded(t)
     assert found.time is t
-    assert (found.step, found.notes) == (None, ())
+    assert (found.steps, found.notes) == ((), ())
 
 
 def test_a_hiccup_of_less_than_two_samples_shifts_what_follows_by_less_than_one():
@@ -54,7 +54,7 @@ def test_late_swapped_and_repeated_stamps_have_one_note():
     rows = np.r_[0:200, 201, 200, 202:300, 299, 300:N]
     found = gridded(t[rows], k[rows])
     np.testing.assert_array_equal(found.signals["x"], k)
-    assert (found.step["missing"], found.step["swapped"], found.step["repeated"]) == (0, 1, 1)
+    assert (found.steps[0]["missing"], found.steps[0]["swapped"], found.steps[0]["repeated"]) == (0, 1, 1)
     (note,) = found.notes
     assert note.endswith("1 row without a place left out, 1 row put in the order of time")
 

@@ -1,4 +1,4 @@
-"""The array types of every signature, whose shapes are in the docstrings, and the robust scale of arrays."""
+"""The array types of every signature, whose shapes are in the docstrings; robust scale of arrays, and runs in masks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,3 +14,36 @@ MAD_TO_STD = 1.4826
 def robust_std(deviations: FloatArray, axis: int | None = None) -> FloatArray:
     """Standard deviation of normal deviations from zero, by the median of their sizes: up to half may be outliers."""
     return np.asarray(MAD_TO_STD * np.median(np.abs(deviations), axis=axis))
+
+
+def runs(mask: BoolArray) -> list[slice]:
+    """Runs of the elements of a mask ``(N,)`` that are True.
+
+    Parameters
+    ----------
+    mask : (N,) bool array
+
+    Returns
+    -------
+    list of slice
+    """
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def long_runs(mask: BoolArray, least: int) -> BoolArray:
+    """Elements of a mask ``(N,)`` in runs of ``least`` or more.
+
+    Parameters
+    ----------
+    mask : (N,) bool array
+    least : int
+
+    Returns
+    -------
+    (N,) bool array
+    """
+    kept = np.zeros(len(mask), bool)
+    for rows in runs(mask):
+        kept[rows] = rows.stop - rows.start >= least
+    return kept

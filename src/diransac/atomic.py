@@ -89,7 +89,7 @@ def _remove_abandoned(parent: Path) -> None:
                     os.close(lock)
 
 
-def write_with(path: str | Path, write: Callable[[Path], None], *, mode: int | None = None) -> None:
+def write_with(path: str | Path, write: Callable[[Path], object], *, mode: int | None = None) -> None:
     """Write a file whole or not at all: a temporary file in a private folder beside it, then a rename.
 
     Parameters
@@ -118,8 +118,4 @@ def write_text(path: str | Path, text: str) -> None:
 
 def write_bytes(path: str | Path, content: bytes | memoryview, *, mode: int | None = None) -> None:
     """Write a file's content, whole or not at all; its permissions as in `write_with`."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_with(path, write, mode=mode)
+    write_with(path, lambda temporary: temporary.write_bytes(content), mode=mode)

@@ -27,9 +27,6 @@ LARGEST_RESULT = 2**28
 LARGEST_TABLE = 2**20
 """Bytes of the largest settings or study."""
 
-DEEPEST = 100
-"""Lists and mappings within each other, in JSON and TOML."""
-
 MOST_NAMES = 3000
 """Names of a model; matrices grow with its square."""
 
@@ -47,8 +44,6 @@ MOST_ELEMENTS, MOST_CELLS = 100_000, 2**24
 
 MOST_JOINTS = 400
 """Joints of a robot; the time for its equations grows with the square."""
-
-_MIB = 2**20
 
 
 class SizeError(ValueError):
@@ -68,7 +63,7 @@ def beyond(most: int, what: str, found: int | None = None) -> str:
         Their number; None: they were counted up to the limit.
     """
     if what == "bytes":
-        most, what, found = most // _MIB, "MiB", None if found is None else -(-found // _MIB)
+        most, what, found = most // 2**20, "MiB", None if found is None else -(-found // 2**20)
     return f"more than {most:,} {what}" if found is None else f"{found:,} {what}; up to {most:,} are possible"
 
 

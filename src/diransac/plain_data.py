@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from diransac.errors import SettingsError
-from diransac.limits import DEEPEST, LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
+from diransac.limits import LARGEST_RESULT, LARGEST_TABLE, beyond, read_bytes
+from diransac.plain_text import literal
 
 
 def read_text(path: str | Path, largest: int = LARGEST_RESULT) -> str:
@@ -69,10 +70,10 @@ def _finite(data: object) -> object:
 def _check_depth(found: object) -> None:
     """Raises ValueError: lists and mappings are nested so deeply that what walks over them may not."""
     level: list[Any] = [found]
-    depth = 0
+    depth, most = 0, 100
     while level:
-        if (depth := depth + 1) > DEEPEST:
-            raise ValueError(f"it is nested too deeply: it has {beyond(DEEPEST, 'levels')}")
+        if (depth := depth + 1) > most:
+            raise ValueError(f"it is nested too deeply: it has {beyond(most, 'levels')}")
         inner = (x.values() if type(x) is dict else x for x in level if type(x) in (dict, list))
         level = [y for x in inner for y in x if type(y) in (dict, list)]
 
@@ -107,6 +108,15 @@ def toml_table(text: str) -> dict[str, Any]:
         found = tomllib.loads(text)
     _check_depth(found)
     return found
+
+
+def toml_text(value: object) -> str:
+    """A text, a number, a flag or a list of them in TOML."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml_text, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return literal(value) if isinstance(value, str) else repr(value)
 
 
 def toml_file(path: Path, what: str) -> dict[str, Any]:

@@ -16,11 +16,6 @@ import keyword
 import re
 from collections.abc import Callable
 
-_LONGEST_COMMENT = 2000
-_LONGEST_CELL = 32_766
-"""Letters that spreadsheets read in a cell, of which one may be a ``'``; Python reads four times as many."""
-
-
 _RESERVED = {
     *re.findall(
         r"\w+",
@@ -74,8 +69,8 @@ def comment(text: str) -> str:
     >>> comment("N*m/rad ??/ 2*/ end\\")
     'N*m/rad ? ?/ 2* / end_'
     """
-    if len(text) > _LONGEST_COMMENT:
-        text = f"{text[:_LONGEST_COMMENT]} ..."
+    if len(text) > 2000:
+        text = f"{text[:2000]} ..."
     plain = text if text.isprintable() else _escaped(text, lambda _: "_")
     # Texts that continue a line of C, end its comment, or end a docstring, and what is written for them.
     for harmful, harmless in (("\\", "_"), ("??", "? ?"), ("*/", "* /"), ("/*", "/ *"), ('"""', "'''")):
@@ -120,7 +115,8 @@ def cell(text: str) -> str:
     >>> cell("=1+1"), cell("flight 1.csv")
     ("'=1+1", 'flight 1.csv')
     """
-    shown = printable(one_line(text[:_LONGEST_CELL]))[:_LONGEST_CELL]
+    longest = 32_766  # letters, of which one may be a ``'``; Python reads four times as many
+    shown = printable(one_line(text[:longest]))[:longest]
     return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
 
 

@@ -57,11 +57,6 @@ def _one_blas_thread() -> Callable[[], object]:
     return undo
 
 
-# Options of glibc's mallopt(3), and the largest threshold of a mapping that its allocator itself would choose.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
-_LARGEST_THRESHOLD, _DEFAULT_MAPPINGS, _NEVER = 32 << 20, 65536, -1
-
-
 def _freed_memory_kept() -> Callable[[], object]:
     chosen = any(name == "GLIBC_TUNABLES" or name.startswith("MALLOC_") for name in os.environ)
     if sys.platform != "linux" or chosen:
@@ -69,32 +64,33 @@ def _freed_memory_kept() -> Callable[[], object]:
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "gnu_get_libc_version"):
         return _nothing
+    trim_threshold, mmap_threshold, mmap_max = -1, -3, -4  # options of mallopt(3)
 
     def undo() -> None:
-        libc.mallopt(_MMAP_MAX, _DEFAULT_MAPPINGS)
-        libc.mallopt(_MMAP_THRESHOLD, _LARGEST_THRESHOLD)
-        libc.mallopt(_TRIM_THRESHOLD, 2 * _LARGEST_THRESHOLD)
+        largest = 32 << 20  # threshold of a mapping that the allocator itself would choose
+        libc.mallopt(mmap_max, 65536)  # its default
+        libc.mallopt(mmap_threshold, largest)
+        libc.mallopt(trim_threshold, 2 * largest)
         libc.malloc_trim(0)
 
-    libc.mallopt(_MMAP_MAX, 0)
-    libc.mallopt(_TRIM_THRESHOLD, _NEVER)
+    libc.mallopt(mmap_max, 0)
+    libc.mallopt(trim_threshold, -1)  # never
     return undo
 
 
 def _working_directory_off_module_path() -> Callable[[], object]:
-    before = os.environ.get(_SAFE_PATH)
-    os.environ[_SAFE_PATH] = "1"
+    name = "PYTHONSAFEPATH"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
 
     def undo() -> None:
         if before is None:
-            del os.environ[_SAFE_PATH]
+            del os.environ[name]
         else:
-            os.environ[_SAFE_PATH] = before
+            os.environ[name] = before
 
     return undo
 
-
-_SAFE_PATH = "PYTHONSAFEPATH"
 
 single_threaded = _Setting(_one_blas_thread)
 """``with single_threaded():`` BLAS has one thread, also while other threads of the process enter and leave."""

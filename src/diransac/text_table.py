@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from diransac.plain_text import one_line
 
-_LEAST_PERCENT = 0.01
-
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows of cells as lines, each column as wide as its widest cell; line breaks within cells are no lines."""
@@ -48,8 +46,8 @@ def duration(seconds: float) -> str:
 def percent(fraction: float) -> str:
     """A fraction in percent to about two digits: ``0.42 %``, ``13 %``, ``< 0.01 %``."""
     x = 100.0 * fraction
-    if 0.0 < abs(x) < _LEAST_PERCENT:
-        return f"{'< ' if x > 0.0 else '> −'}{_LEAST_PERCENT} %"
+    if 0.0 < abs(x) < 0.01:
+        return f"{'< ' if x > 0.0 else '> −'}0.01 %"
     if 99.0 < x < 100.0:
         return f"{min(x, 99.9):.1f} %"
     rounded = f"{x:.0f}" if math.isfinite(x) and 10.0 <= abs(x) < 1e5 else number(x, 2)

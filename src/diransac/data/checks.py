@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from diransac.data.log import Log
     from diransac.model import Model
 
-_ROUNDING = 1e-6
+ROUNDING = 1e-6
+"""Part of a sample that rounding may make of equal times."""
 _SHORTEST_ABBREVIATION, _LONGEST_NAME = 3, 100
 """Letters of a name that are compared."""
-_PART = 1 << 15
-"""Stamps whose intervals stay in a processor's cache."""
 
 
 # ---------------------------------------------------------------------- columns
@@ -173,7 +172,8 @@ def _where(word: str, flags: Mapping[str, npt.NDArray[np.bool_]], time: FloatArr
 
 def shortest_and_longest(time: FloatArray) -> tuple[float, float]:
     """Intervals of stamps ``(N,)``, s."""
-    parts = (np.diff(time[k : k + _PART + 1]) for k in range(0, len(time) - 1, _PART))
+    n = 1 << 15  # stamps whose intervals stay in a processor's cache
+    parts = (np.diff(time[k : k + n + 1]) for k in range(0, len(time) - 1, n))
     shortest, longest = zip(*((float(x.min()), float(x.max())) for x in parts), strict=True)
     return min(shortest), max(longest)
 
@@ -209,7 +209,7 @@ def check_even(time: FloatArray, source: str) -> None:
     Every row is taken to last ``dt``, so that single intervals matter, and the drift of the clock does not.
     """
     (shortest, longest), dt = shortest_and_longest(time), float(time[-1] - time[0]) / (len(time) - 1)
-    if max(longest - dt, dt - shortest) <= (0.2 + _ROUNDING) * dt:
+    if max(longest - dt, dt - shortest) <= (0.2 + ROUNDING) * dt:
         return
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -220,6 +220,11 @@ def check_even(time: FloatArray, source: str) -> None:
         f"{source}: time is not uniform: {what} after t = {time[row]:.6g} s (row {row}) is {steps[row]:.4g} s long, "
         f"the usual interval {usual:.4g} s; resample it: --resample {1.0 / usual:.4g}, or read_log(..., resample=...)"
     )
+
+
+def are_many(n_bad: int, n: int) -> bool:
+    """True for more than 1 in 100, and more than one, of ``n`` rows, lines or fields: these are not left out."""
+    return n_bad > max(1, n // 100)
 
 
 def is_implausible(n_new: float, n: int) -> bool:
@@ -247,7 +252,7 @@ def check_clock(time: FloatArray, source: str, *, in_file: bool = False) -> list
     if dt < 1e-7:
         return [f"{apart}: check the unit of t, and pass --scale t=FACTOR if it is not in seconds"]
     # The interval from which on these clocks, with their ticks, are more likely than the next.
-    clocks = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, 1.0 + _ROUNDING))
+    clocks = (("nanoseconds", 1e-9, 2e5), ("microseconds", 1e-6, 500.0), ("milliseconds", 1e-3, 1.0 + ROUNDING))
     unit, tick = next(((unit, tick) for unit, tick, least in clocks if dt > least), ("seconds", 1.0))
     if unit == "seconds":
         return []

@@ -20,26 +20,26 @@ from diransac.errors import LogError
 
 
 @dataclass(frozen=True)
-class Gridded:
-    """Columns on a uniform grid.
+class Aligned:
+    """Columns on one clock.
 
     Parameters
     ----------
     time : (n,) array
     signals : mapping of str to (n,) array
         NaN where no row belongs to a sample.
-    recorded : (n,) bool array
-        Samples that have a row.
-    step : dict, optional
-        Of the history; None where the time was even.
+    recorded : (n,) bool array, optional
+        Samples that have a row; None: all.
+    steps : tuple of dict
+        Of the history; empty where the time was even.
     notes : tuple of str
-        A sentence on what was done, if anything was.
+        Sentences on what was done, if anything was.
     """
 
     time: FloatArray
     signals: Mapping[str, FloatArray]
-    recorded: BoolArray
-    step: dict[str, Any] | None = None
+    recorded: BoolArray | None = None
+    steps: tuple[dict[str, Any], ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -58,17 +58,12 @@ def in_order(time: FloatArray, source: str) -> IntArray | slice:
     rows = np.argsort(time, kind="stable")
     rows = rows[np.r_[True, np.diff(time[rows]) > 0.0]]
     usual = float(np.median(np.diff(time[rows]))) if len(rows) > 1 else 0.0
-    if len(rows) < 2 or shortest < -3.5 * usual or _are_many(n - len(rows), n):
+    if len(rows) < 2 or shortest < -3.5 * usual or checks.are_many(n - len(rows), n):
         checks.check_time_order(time, source)
     return rows
 
 
-def _are_many(n_repeated: int, n: int) -> bool:
-    """True where more than a few of ``n`` rows have no sample of their own."""
-    return n_repeated > max(1.0, 0.01 * n)
-
-
-def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Gridded:
+def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str) -> Aligned:
     """Columns of a log on the uniform grid on which it was sampled; as they are where the time is even.
 
     Parameters
@@ -84,7 +79,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
         There is no such grid: as `in_order`; or intervals have any length.
     """
     if is_even(time):
-        return Gridded(time, signals, np.ones(len(time), bool))
+        return Aligned(time, signals)
     rows: IntArray = np.arange(len(time))[in_order(time, source)]
     dt = float(np.median(np.diff(time[rows])))
     with np.errstate(over="ignore"):
@@ -98,7 +93,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     n_repeated = len(time) - int(kept.sum())
     # Jitter may be a third of a sample; the phase of the grid is uncertain by the rest.
     is_grid = (np.abs(off) > 0.4).mean() <= 0.02 and n_gaps <= 0.25 * len(rows)
-    if not is_grid or _are_many(n_repeated, len(time)):
+    if not is_grid or checks.are_many(n_repeated, len(time)):
         checks.check_even(time[rows], source)
         raise LogError(f"{source}: {n_repeated} of {len(time)} rows repeat a time; remove them")
     rows, at = rows[kept], places[kept]
@@ -112,7 +107,7 @@ def on_own_grid(time: FloatArray, signals: Mapping[str, FloatArray], source: str
     step = {"step": "grid", "rate": 1.0 / dt, "rows": [len(time), n], "missing": int((~recorded).sum())}
     step |= {"repeated": n_repeated, "swapped": int((np.diff(time) < 0.0).sum())}
     said = _sentence(step, time[rows], at, float(np.quantile(np.abs(off), 0.95)))
-    return Gridded(grid, on_grid, recorded, step, (said,))
+    return Aligned(grid, on_grid, recorded, (step,), (said,))
 
 
 def is_even(time: FloatArray) -> bool:

@@ -125,6 +125,12 @@ def convolve(values: FloatArray, kernel: FloatArray) -> FloatArray:
     return np.asarray(np.fft.irfft(np.fft.rfft(values, n, axis=0) * response, n, axis=0)[L : L + N])
 
 
+def mirrored_windows(values: Any, reach: int) -> Any:
+    """The samples ``(N, ..., 2 reach + 1)`` around each along the first axis, mirrored at both ends."""
+    padded = np.pad(values, [(reach, reach), *[(0, 0)] * (values.ndim - 1)], mode="reflect")
+    return np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
+
+
 def median_filter(values: Any, size: int) -> Any:
     """Median of the samples around each, mirrored at both ends.
 
@@ -141,8 +147,7 @@ def median_filter(values: Any, size: int) -> Any:
         Of the same kind.
     """
     reach = size // 2
-    padded = np.pad(values, [(reach, reach), *[(0, 0)] * (values.ndim - 1)], mode="reflect")
-    windows, medians = np.lib.stride_tricks.sliding_window_view(padded, size, axis=0), np.empty_like(values)
+    windows, medians = mirrored_windows(values, reach), np.empty_like(values)
     for first in range(0, len(values), _ROWS_AT_A_TIME):
         some = slice(first, first + _ROWS_AT_A_TIME)
         medians[some] = np.partition(windows[some], reach)[..., reach]

@@ -187,8 +187,7 @@ class Log:
         if any(len(x) != len(stamps) for x in signals.values()):
             return cls(stamps, signals, units, source)  # which raises
         found = on_own_grid(stamps, signals, source)
-        history = () if found.step is None else (found.step,)
-        log = cls(found.time, found.signals, units, source, history, unusable=unusable or {})
+        log = cls(found.time, found.signals, units, source, found.steps, unusable=unusable or {})
         notes = (*found.notes, *checks.check_clock(log.time, source), *log.findings(found.recorded))
         return replace(log, notes=notes)
 
@@ -304,7 +303,7 @@ class Log:
         LogError
             Fewer than 2 rows lie there.
         """
-        slack = 1e-6 * self.dt  # rounding
+        slack = checks.ROUNDING * self.dt
         first, last = np.searchsorted(self.time, [start - slack, end + slack])
         if last - first < 2:
             raise LogError(

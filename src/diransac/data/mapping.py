@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import LogError
 from diransac.text_table import some
 
@@ -26,7 +26,7 @@ class Condition:
     below: float = math.inf
     equals: float | str | None = None
 
-    def holds(self, values: FloatArray | TextArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def holds(self, values: FloatArray | TextArray) -> BoolArray:
         """Flags (n,); False for NaN, and for texts where numbers are compared, or the reverse."""
         if (values.dtype == np.object_) != isinstance(self.equals, str):
             return np.zeros(len(values), np.bool_)
@@ -199,12 +199,12 @@ class LogMapping:
     time: str = "header"
     time_column: str | None = None
     time_scale: float = 1.0
-    preparation: Mapping[str, Any] | None = None
+    preparation: Mapping[str, Any] = field(default_factory=dict)
     text: str = ""
 
     def option(self, name: str) -> Any:
         """A step of the preparation, or None."""
-        return (self.preparation or {}).get(name)
+        return self.preparation.get(name)
 
     def events_in(self, fields: Mapping[str, Sequence[str]]) -> list[Event]:
         """Events whose topic and fields a log has."""
@@ -234,7 +234,7 @@ class LogMapping:
             An entry that is not optional has no topic or field; no entry has.
         """
         found: dict[str, MappedSignals] = {}
-        lacking: dict[str, str] = {}
+        lacking: dict[str, tuple[str, bool]] = {}
         only = next(iter(fields)) if len(fields) == 1 else ""
         for entry in [one for whole in self.signals for one in _of_elements(whole, elements.get(whole.topic or only))]:
             topic = entry.topic or only
@@ -244,13 +244,11 @@ class LogMapping:
                     found.setdefault(name, replace(entry, topic=topic))
             else:
                 for name in entry.names:
-                    lacking.setdefault(name, why if entry.optional else f"!{why}")
-        absent = {name: why for name, why in lacking.items() if name not in found}
+                    lacking.setdefault(name, (why, entry.optional))
+        absent = {name: why for name, (why, _) in lacking.items() if name not in found}
         for name, why in absent.items():
-            if why.startswith("!"):
-                raise LogError(
-                    f'{source}: {self.source} has "{name}" from {why[1:]}; remove it, or say optional = true'
-                )
+            if not lacking[name][1]:
+                raise LogError(f'{source}: {self.source} has "{name}" from {why}; remove it, or say optional = true')
         if not found:
             what, there = ("columns", fields[""]) if set(fields) == {""} else ("topics", list(fields))
             raise LogError(f"{source}: {self.source} fits none of its {what}; found {some(there)}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, long_runs, runs
 from diransac.data import preprocessing
 from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.log import Log
@@ -263,21 +263,6 @@ def bulk_range(values: FloatArray) -> tuple[float, float]:
     return float(kept.min()), float(kept.max())
 
 
-def runs(mask: BoolArray) -> list[slice]:
-    """Runs of the elements of a mask ``(N,)`` that are True.
-
-    Parameters
-    ----------
-    mask : (N,) bool array
-
-    Returns
-    -------
-    list of slice
-    """
-    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolArray:
     """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
 
@@ -297,24 +282,6 @@ def _slow_signals(log: Log, names: Sequence[str]) -> str:
     if not slow:
         return ""
     return f": {', '.join(slow)}, the log at {1.0 / log.dt:.4g} Hz; use lo-diransac, which needs no complete rows"
-
-
-def long_runs(mask: BoolArray, least: int) -> BoolArray:
-    """Elements of a mask ``(N,)`` in runs of ``least`` or more.
-
-    Parameters
-    ----------
-    mask : (N,) bool array
-    least : int
-
-    Returns
-    -------
-    (N,) bool array
-    """
-    kept = np.zeros(len(mask), bool)
-    for rows in runs(mask):
-        kept[rows] = rows.stop - rows.start >= least
-    return kept
 
 
 def silent_rows(known: BoolArray, dt: float) -> BoolArray:

@@ -13,6 +13,7 @@ from diransac.data.mapping_file import BUILT_IN, load_mapping
 from diransac.data.readers.recording import shortened
 from diransac.data.units import conversion
 from diransac.errors import LogError
+from diransac.plain_data import toml_text
 from diransac.plain_text import comment, literal, one_line
 from diransac.text_table import some
 
@@ -251,29 +252,22 @@ def _origin(entry: MappedSignals, name: str) -> str:
     return (f"{entry.topic}.{label}" if entry.topic else label) + frame
 
 
-def _value(value: object) -> str:
-    """A text, a number or a list of them in TOML."""
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    return literal(value) if isinstance(value, str) else repr(value)
-
-
 def _toml_of_condition(condition: Condition) -> str:
     """A condition as TOML, without the limits that it does not have."""
     known = {key: x for key, x in vars(condition).items() if x not in (None, math.inf, -math.inf)}
-    return "{ " + ", ".join(f"{key} = {_value(x)}" for key, x in known.items()) + " }"
+    return "{ " + ", ".join(f"{key} = {toml_text(x)}" for key, x in known.items()) + " }"
 
 
 def _toml(entry: MappedSignals, units: Mapping[str, str]) -> str:
     """One entry as TOML."""
     several = len(entry.names) > 1
     pick = list if several else next
-    lines = ["[[signals]]", f"name = {_value(pick(iter(entry.names)))}"]
+    lines = ["[[signals]]", f"name = {toml_text(pick(iter(entry.names)))}"]
     lines += [f"topic = {literal(entry.topic)}"] if entry.topic else []
-    lines.append(f"field = {_value(pick(iter(entry.fields)))}")
+    lines.append(f"field = {toml_text(pick(iter(entry.fields)))}")
     for key, numbers, neutral in (("scale", entry.factors, 1.0), ("offset", entry.offsets, 0.0)):
         if any(x != neutral for x in numbers):
-            lines.append(f"{key} = {_value(numbers[0] if len(set(numbers)) == 1 else list(numbers))}")
+            lines.append(f"{key} = {toml_text(numbers[0] if len(set(numbers)) == 1 else list(numbers))}")
     if entry.frame is not None:
         lines += ['order = "wxyz"'] if len(entry.names) == 4 else []
         lines.append(f"frame = {literal(entry.frame)}")

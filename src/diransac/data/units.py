@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
@@ -122,8 +122,7 @@ def one_turn(unit: str) -> float | None:
 
 def _factor(a: _Unit, b: _Unit) -> float | None:
     """The factor between two units of one dimension."""
-    kinds = {n for n in ("rad", "cycle") if n in a.powers} | {n for n in ("rad", "cycle") if n in b.powers}
-    if a.dimension != b.dimension or len(kinds) == 2:
+    if a.dimension != b.dimension or {"rad", "cycle"} <= {*a.powers, *b.powers}:
         return None
     return a.factor / b.factor
 
@@ -205,19 +204,14 @@ def _atom(tokens: list[str], at: int) -> tuple[_Unit, int]:
 
 
 def _symbol(text: str) -> _Unit:
-    for unit in _known(text):
-        return unit
+    """Unit of a symbol, whole names before prefixes, or of a positive number."""
+    if text in _PREFIXABLE:
+        return _PREFIXABLE[text]
+    if text in _NAMED:
+        return _NAMED[text]
+    if text[:1] in _PREFIXES and text[1:] in _PREFIXABLE:
+        return _Unit(_PREFIXES[text[0]]) * _PREFIXABLE[text[1:]]
     factor = float(text)
     if not 0.0 < factor < math.inf:
         raise ValueError("a unit is a positive number")
     return _Unit(factor)
-
-
-def _known(text: str) -> Iterator[_Unit]:
-    """Units of a symbol, whole names before prefixes."""
-    if text in _PREFIXABLE:
-        yield _PREFIXABLE[text]
-    if text in _NAMED:
-        yield _NAMED[text]
-    if text[:1] in _PREFIXES and text[1:] in _PREFIXABLE:
-        yield _Unit(_PREFIXES[text[0]]) * _PREFIXABLE[text[1:]]

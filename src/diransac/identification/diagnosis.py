@@ -17,9 +17,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray, robust_std
+from diransac.arrays import FloatArray, IntArray, robust_std, runs
 from diransac.data.input_timing import InputTiming
-from diransac.data.segment import runs
 from diransac.identification.serialization import Masks, Number, Numbers, Series, Values, WholeNumbers
 
 

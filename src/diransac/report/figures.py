@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data.segment import runs
+from diransac.arrays import BoolArray, FloatArray, IntArray, runs
 
 Tick = tuple[str, str]
 """Position in percent of an axis, and text."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from diransac import arrays
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import segment
 from diransac.data.log import Log
@@ -225,7 +226,7 @@ def _not_held(log: Log) -> list[tuple[float, float, str]]:
 def _left_out_text(log: Log, run: Run, timeline: Timeline) -> list[str]:
     """A sentence about the stretches that are left out, with their reasons; none where nothing is."""
     found = _not_held(log)
-    for gap in segment.runs(_left_out(run, log, timeline)):
+    for gap in arrays.runs(_left_out(run, log, timeline)):
         start, stop = float(log.time[gap.start]), float(log.time[gap.stop - 1])
         if not any(a <= stop and start <= b for a, b, _ in found):
             found.append((start, stop, "samples are missing"))

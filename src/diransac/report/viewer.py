@@ -26,11 +26,10 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, runs
 from diransac.atomic import write_with
 from diransac.data.checks import rows_per_sample
 from diransac.data.log import Log
-from diransac.data.segment import runs
 from diransac.errors import ResultError
 from diransac.identification.assessment.open_loop import simulate
 from diransac.identification.result import Result

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from diransac.atomic import write_text
 from diransac.errors import ResultError, SettingsError
-from diransac.plain_data import toml_file
+from diransac.plain_data import toml_file, toml_text
 from diransac.plain_text import literal, one_line, printable
 from diransac.user_files import file_and_name, is_description
 
@@ -283,15 +283,7 @@ def quoted(words: Sequence[str]) -> str:
 def _toml(options: Mapping[str, Any]) -> str:
     """Options as TOML, values before tables."""
     plain = {key: value for key, value in options.items() if not isinstance(value, dict)}
-    lines = [f"{key} = {_value(value)}" for key, value in plain.items()]
+    lines = [f"{key} = {toml_text(value)}" for key, value in plain.items()]
     for key in (key for key in options if key not in plain):
-        lines += ["", f"[{key}]", *(f"{literal(name)} = {_value(x)}" for name, x in options[key].items())]
+        lines += ["", f"[{key}]", *(f"{literal(name)} = {toml_text(x)}" for name, x in options[key].items())]
     return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return literal(value) if isinstance(value, str) else repr(value)

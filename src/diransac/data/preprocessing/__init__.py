@@ -3,13 +3,7 @@
 Each step adds one mapping to ``Log.history`` and, where it changes samples, a sentence to ``Log.notes``.
 """
 
-from diransac.data.preprocessing.continuity import (
-    continuous,
-    continuous_quaternions,
-    unit_quaternions,
-    unwrap,
-    whole_quaternions,
-)
+from diransac.data.preprocessing.continuity import continuous, continuous_quaternions, unwrap
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
 from diransac.data.preprocessing.steps import (
@@ -42,7 +36,5 @@ __all__ = [
     "scale",
     "shift",
     "unit_factors",
-    "unit_quaternions",
     "unwrap",
-    "whole_quaternions",
 ]

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
-from diransac.data.filters import median_filter
+from diransac.data.checks import ROUNDING
+from diransac.data.filters import median_filter, mirrored_windows
 from diransac.data.units import one_turn
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def interpolated(signals: Mapping[str, FloatArray], left: IntArray, weight: Floa
 def _between(values: FloatArray, left: IntArray, weight: FloatArray) -> FloatArray:
     """Linear interpolation without neighbours of zero weight."""
     mixed = (1.0 - weight) * values[left] + weight * values[left + 1]
-    return np.where(weight < 1e-6, values[left], np.where(weight > 1.0 - 1e-6, values[left + 1], mixed))
+    return np.where(weight < ROUNDING, values[left], np.where(weight > 1.0 - ROUNDING, values[left + 1], mixed))
 
 
 def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:
@@ -330,9 +331,7 @@ def _with_one_sign(log: Log, names: Sequence[str]) -> Log:
 
 def _neighbours(n: int, reach: int) -> IntArray:
     """Indices ``(n, 2 reach + 1)`` of the samples about each, mirrored at both ends; fewer where there are fewer."""
-    reach = min(reach, n - 1)
-    padded = np.pad(np.arange(n), reach, mode="reflect")
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1))
+    return np.asarray(mirrored_windows(np.arange(n), min(reach, n - 1)))
 
 
 def _medoids(

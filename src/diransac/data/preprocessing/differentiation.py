@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, runs
 from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.filters import REACH, FilterSpecification, convolve, half_length, kernels
 from diransac.data.preprocessing.continuity import continuous, unit_quaternions, whole_quaternions
@@ -344,7 +344,8 @@ def _bridge(values: FloatArray) -> FloatArray:
     missing = np.isnan(values)
     rows = np.arange(len(values))
     bridged = np.interp(rows, rows[~missing], values[~missing])
-    for begin, end in _gaps(missing):
+    for gap in runs(missing):
+        begin, end = gap.start, gap.stop
         near = slice(max(0, 2 * begin - end - 2), 2 * end - begin + 2)
         x, known = 2.0 * (rows[near] - begin) / (end - begin) - 1.0, ~missing[near]
         if begin > 0 and end < len(values) and known.sum() > 4:
@@ -353,18 +354,12 @@ def _bridge(values: FloatArray) -> FloatArray:
     return bridged
 
 
-def _gaps(missing: BoolArray) -> list[tuple[int, int]]:
-    """Begin and end of each run of missing rows."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _near_long_gaps(values: FloatArray, longest: float, reach: int) -> BoolArray:
     """Rows (N,) within the filter's reach of more than ``longest`` missing samples in a row."""
     near = np.zeros(len(values), dtype=bool)
-    for begin, end in _gaps(np.isnan(values)):
-        if end - begin > max(longest, 1.0):
-            near[max(0, begin - reach) : end + reach] = True
+    for gap in runs(np.isnan(values)):
+        if gap.stop - gap.start > max(longest, 1.0):
+            near[max(0, gap.start - reach) : gap.stop + reach] = True
     return near
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diransac.arrays import MAD_TO_STD, BoolArray, FloatArray
-from diransac.data.filters import median_filter
+from diransac.data.filters import median_filter, mirrored_windows
 from diransac.data.preprocessing.continuity import unwrap
 from diransac.errors import SettingsError
 
@@ -124,10 +124,8 @@ def _running_median(values: FloatArray, window: int) -> FloatArray:
 
 
 def _windows(values: FloatArray, window: int) -> FloatArray:
-    """The samples ``(N, ..., window)`` around each, mirrored at the ends."""
-    reach = min(window // 2, len(values) - 1)
-    padded = np.pad(values, [(reach, reach), *[(0, 0)] * (values.ndim - 1)], mode="reflect")
-    return np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
+    """The samples ``(N, ..., window)`` around each, mirrored at the ends; fewer where there are fewer."""
+    return np.asarray(mirrored_windows(values, min(window // 2, len(values) - 1)))
 
 
 def _middle(values: FloatArray, axis: int = -1) -> FloatArray:

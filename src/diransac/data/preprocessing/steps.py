@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
-from diransac.data.checks import is_implausible
+from diransac.arrays import FloatArray, runs
+from diransac.data.checks import ROUNDING, is_implausible
+from diransac.data.clock import Aligned
 from diransac.data.preprocessing.continuity import interpolated
 from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 Column = TypeVar("Column")
-
-_ROUNDING = 1e-6
 
 
 # ---------------------------------------------------------------------- names and factors
@@ -211,8 +210,7 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     rows = np.flatnonzero(kept)
     part, inside = log[int(rows[0]) : int(rows[-1]) + 1], kept[rows[0] : rows[-1] + 1]
     signals = {n: x if n in events else np.where(inside, x, np.nan) for n, x in part.signals.items()}
-    edges = np.flatnonzero(np.diff(np.r_[True, kept, True].astype(int)))
-    stretches = [[float(log.time[a]), float(log.time[b - 1])] for a, b in edges.reshape(-1, 2)]
+    stretches = [[float(log.time[x.start]), float(log.time[x.stop - 1])] for x in runs(~kept)]
     step |= {"left_out": stretches}
     if not stretches:
         return log.with_step(step)
@@ -221,7 +219,7 @@ def _kept(log: Log, kept: npt.NDArray[np.bool_], step: dict[str, Any], why: str,
     return part.with_step(step, notes=[note], signals=signals)
 
 
-def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
+def prepared(log: Log, steps: Mapping[str, Any]) -> Log:
     """Log after steps that need no model, by the keys of a mapping file; others are not done.
 
     Parameters
@@ -236,7 +234,7 @@ def prepared(log: Log, steps: Mapping[str, Any] | None) -> Log:
     LogError, SettingsError
         As each step.
     """
-    found = {name: x for name, x in (steps or {}).items() if x is not None}
+    found = {name: x for name, x in steps.items() if x is not None}
     named = {name: [x] if isinstance(x, str) else x for name, x in found.items() if name in ("while", "despike")}
     if "from" in found or "until" in found:
         log = log.between(found.get("from", -math.inf), found.get("until", math.inf))
@@ -281,17 +279,15 @@ def resample(log: Log, rate: float | str = "median") -> Log:
     There is no anti-aliasing filter: at a lower rate, components above half of it are folded to lower frequencies, and
     a note says so.
     """
-    time, signals, step, notes = resample_columns(log.time, log.signals, rate, log.source)
-    return log.with_step(step, time=time, signals=signals, notes=notes)
+    made = resampled(log.time, log.signals, rate, log.source)
+    return log.with_step(made.steps[0], time=made.time, signals=made.signals, notes=made.notes)
 
 
-def resample_columns(
-    time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str
-) -> tuple[FloatArray, dict[str, FloatArray], dict[str, Any], list[str]]:
-    """Time, columns, step of the history and notes at a uniform rate; ``time`` (N,) increases."""
+def resampled(time: FloatArray, signals: Mapping[str, FloatArray], rate: float | str, source: str) -> Aligned:
+    """Columns at a uniform rate; ``time`` (N,) increases."""
     grid, hertz = resampling_grid(time, rate, source)
     step, notes = describe_resampling(time, grid, hertz)
-    return grid, interpolate_at(time, signals, grid, hertz), step, notes
+    return Aligned(grid, interpolate_at(time, signals, grid, hertz), steps=(step,), notes=tuple(notes))
 
 
 def describe_resampling(time: FloatArray, grid: FloatArray, hertz: float) -> tuple[dict[str, Any], list[str]]:
@@ -324,7 +320,7 @@ def interpolate_at(
     An interval of more than three and a half median ones (and more than one new sample) is a gap.
     """
     left, weight, blank = _in_gaps(time, grid, _gaps(time, hertz))
-    slack = _ROUNDING / hertz
+    slack = ROUNDING / hertz
     blank |= (grid < time[0] - slack) | (grid > time[-1] + slack)
     return {name: np.where(blank, np.nan, x) for name, x in interpolated(signals, left, weight).items()}
 
@@ -342,7 +338,7 @@ def _in_gaps(
     """Sample before each new one, the new one's weight between the two, and whether it lies in a gap: (n,) each."""
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, len(time) - 2)
     weight = np.clip((grid - time[left]) / np.diff(time)[left], 0.0, 1.0)
-    return left, weight, gaps[left] & (weight > _ROUNDING) & (weight < 1.0 - _ROUNDING)
+    return left, weight, gaps[left] & (weight > ROUNDING) & (weight < 1.0 - ROUNDING)
 
 
 def _rate(rate: float | str, usual: float) -> float:
@@ -415,7 +411,7 @@ def shift(log: Log, delays: Mapping[str, float]) -> Log:
             raise SettingsError(f'the delay of "{name}" is {delay}; give seconds')
     for delay in dict.fromkeys(delays.values()):
         rows = n - delay / log.dt
-        covered &= (rows >= -_ROUNDING) & (rows <= n[-1] + _ROUNDING)
+        covered &= (rows >= -ROUNDING) & (rows <= n[-1] + ROUNDING)
         rows = np.clip(rows, 0.0, n[-1])
         left = np.minimum(rows.astype(np.intp), len(log) - 2)
         late = {name: log[name] for name, x in delays.items() if x == delay}

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diransac.data.readers.recording import Recording, Samples, Stamps, seconds_since
-from diransac.data.readers.table import DAMAGE, undamaged
+from diransac.data.readers.table import DAMAGE, installed, undamaged
 from diransac.errors import LogError
 
-INSTALL = 'install them with pip install "diransac[logs]"'
-LARGEST_CHUNK, _MAGIC_SIZE = 1 << 29, 8
+LARGEST_CHUNK, MAGIC = 1 << 29, b"\x89MCAP0\r\n"
+"""Bytes of a chunk at most; what stands at the start and at the end of an MCAP file."""
 _MOST_FIELDS, _MOST_ELEMENTS = 2000, 64
-_OTHER_CLOCK, _LATEST = 3600 * 10**9, 1 << 62
+_LATEST = 1 << 62
 _NUMBERS = (bool, int, float, np.number, np.bool_)
 
 
@@ -98,7 +98,8 @@ class BagRecording(Recording):
         Raises LogError: some topics have times of another clock, and others have not.
         """
         origin = self._origin or 0
-        far = {n: x for n, x in columns.items() if x.is_stamped and abs(x.stamps[0] - x.times[0]) > _OTHER_CLOCK}
+        hour = 3600 * 10**9  # later than any message is recorded
+        far = {n: x for n, x in columns.items() if x.is_stamped and abs(x.stamps[0] - x.times[0]) > hour}
         near = [name for name, x in columns.items() if name not in far and x.times]
         if far and near:
             topic, found = next(iter(far.items()))
@@ -112,8 +113,7 @@ class BagRecording(Recording):
     def _samples(self, topic: str, found: _Columns, origin: int) -> Samples:
         for label, values in found.values.items():
             if label in found.missing and label not in found.texts and np.isnan(np.frombuffer(values)).all():
-                known = ", ".join(self._fields[topic])
-                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {known}')
+                raise self.lacking(topic, label)
         times = np.frombuffer(found.stamps if found.is_stamped else found.times, dtype=np.int64)
         columns = {label: np.frombuffer(x, dtype=np.float64) for label, x in found.values.items()}
         texts = {label: np.array(x, dtype=np.object_) for label, x in found.texts.items()}
@@ -212,7 +212,7 @@ def _stamp(message: Any) -> int:
     if not isinstance(seconds, (int, np.integer)) or not isinstance(fraction, (int, np.integer)):
         return 0
     nanoseconds = int(seconds) * 1_000_000_000 + int(fraction)
-    return nanoseconds if abs(nanoseconds) < 1 << 62 else 0
+    return nanoseconds if abs(nanoseconds) < _LATEST else 0
 
 
 def _field_names(message: Any, kinds: tuple[type, ...]) -> tuple[str, ...]:
@@ -252,12 +252,9 @@ class McapFile:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        try:
+        with installed(f"{source}: MCAP needs the packages mcap and rosbags"):
+            import rosbags.typesys  # noqa: F401  # which decodes messages
             from mcap.reader import make_reader
-            from rosbags.typesys import get_typestore
-        except ImportError as error:
-            raise LogError(f"{source}: MCAP needs the packages mcap and rosbags; {INSTALL}") from error
-        del get_typestore
         self.notes: list[str] = []
         self.topics: Collection[str] | None = None
         self._path, self._source = path, source
@@ -308,7 +305,7 @@ class McapFile:
                     elif wanted is None or self._may_hold(file.tell(), wanted):
                         yield from breakup_chunk(unpacked(record))
             except damages() as error:
-                if file.tell() <= _MAGIC_SIZE:
+                if file.tell() <= len(MAGIC):
                     raise LogError(f"{self._source}: it is not an MCAP file") from error
                 what = f"{type(error).__name__}: {' '.join(str(error).split())}"
                 note = f"the file is cut off or damaged at byte {file.tell()} ({what:.80}); what follows is left out"
@@ -403,11 +400,9 @@ class RosBag:
     """
 
     def __init__(self, path: Path, source: str) -> None:
-        try:
+        with installed(f"{source}: bags need the package rosbags"):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise LogError(f"{source}: bags need the package rosbags; {INSTALL}") from error
         self.notes: list[str] = []
         self._source = source
         self._open = partial(AnyReader, [path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

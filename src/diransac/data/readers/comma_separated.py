@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.data.checks import are_many
 from diransac.data.files import COMMENT
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, check_size, check_unique, undamaged, with_metadata
@@ -197,7 +198,7 @@ def joined(files: Sequence[tuple[str, bytes]], source: str, repairs: Repairs) ->
         check_unique([*columns, *table.columns], source)
         columns |= table.columns
         units |= table.units
-        rows[name] = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
+        rows[name] = table.n_rows
     if len(set(rows.values())) > 1:
         raise LogError(
             f"{source}: its files have different numbers of rows: {', '.join(f'{n} {k}' for n, k in rows.items())}"
@@ -240,8 +241,11 @@ def _without_ragged(lines: list[str], separator: str, repairs: Repairs, source: 
     expected = lines[0].count(separator)
     kept = [line for line in lines if line.count(separator) == expected]
     n = len(lines) - len(kept)
+    if are_many(n, len(lines)):
+        raise LogError(
+            f"{source}: {n} of {len(lines)} lines have not {expected + 1} fields: too many to repair (1 in 100)"
+        )
     if n:
-        repairs.check_share(n, len(lines), f"lines have not {expected + 1} fields", source)
         repairs.record("rows", f"{n} line{'s' * (n > 1)} without {expected + 1} fields left out")
     return kept
 
@@ -396,7 +400,7 @@ def _numbers(fields: pl.Series, first: int, separator: str, name: str, repairs: 
             return seconds
         if seconds is not None:
             return _Times(seconds, reason)
-        if "cells" not in repairs or n > max(1, len(bad) // 100):
+        if "cells" not in repairs or are_many(n, len(bad)):
             return reason
         repairs.record("cells", f'{name} has {n} field{"s" * (n > 1)} without a number, the first "{text[row]:.30}"')
     return numbers.fill_null(np.nan).to_numpy().astype(np.float64)

@@ -22,7 +22,6 @@ from diransac.errors import LogError
 
 MAGIC = b"\xbc"
 _STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}
-_MOST_EVENTS, _MOST_VARIABLES = 256, 1024
 
 
 class CrazyflieRecording(Recording):
@@ -35,7 +34,7 @@ class CrazyflieRecording(Recording):
         super().__init__(source)
         with undamaged(f"{source}: it is not a Crazyflie log, or its header is damaged"):
             version, number = struct.unpack_from("<HH", data, 1)
-            if version not in _STAMPS or number > _MOST_EVENTS:
+            if version not in _STAMPS or number > 256:  # more events than a log has
                 raise ValueError(f"version {version}, {number} events")
             self._stamp, self._tick = _STAMPS[version]
             self._kinds, at = self._events(data, number)
@@ -54,7 +53,7 @@ class CrazyflieRecording(Recording):
             (n,) = struct.unpack_from("<H", data, at)
             at += 2
             fields = []
-            for _ in range(min(n, _MOST_VARIABLES)):
+            for _ in range(min(n, 1024)):  # and variables than an event has
                 text, at = _text(data, at)
                 match = re.fullmatch(r"(.+)\(([bBhHiIqQfd?])\)", text)
                 if match is None:

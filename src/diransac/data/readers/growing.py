@@ -18,9 +18,9 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.mapping import MappedSignals
-from diransac.data.readers.bags import LARGEST_CHUNK, BagRecording, McapFile, damages, unpacked
+from diransac.data.readers.bags import LARGEST_CHUNK, MAGIC, BagRecording, McapFile, damages, unpacked
 from diransac.data.readers.comma_separated import fields_of, head_of, read_csv
-from diransac.data.readers.recording import Samples
+from diransac.data.readers.recording import Samples, nearest
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, readable, undamaged
 from diransac.data.readers.topics import entries_of, is_one_table, signals_of, wanted_by
@@ -37,10 +37,6 @@ Part = tuple[dict[str, FloatArray], dict[str, str]]
 _TEXTS = (".csv", ".tsv", ".txt")
 _BLOCK = 1 << 20
 """Bytes that are read at once: a tenth of a second of parsing."""
-_MAGIC, _HEAD = b"\x89MCAP0\r\n", 9
-"""Before the first record of an MCAP file and after the last; bytes of the kind and length of a record."""
-_RECENT = 1000
-"""Stamps of the fastest topic to which samples of others may belong: seconds, at any rate that is tracked."""
 
 
 class Growing:
@@ -245,7 +241,7 @@ class GrowingCsv(Growing):
             return False
         self._head, self._waiting, self._has_head = self._waiting[:n], self._waiting[n:], True
         (first,) = self._tables(self._waiting[:1])
-        self._numeric = {name for name, x in first.columns.items() if not isinstance(x, str)}
+        self._numeric = set(first.numbers)
         return True
 
     def _complete_rows(self) -> list[str]:
@@ -268,13 +264,13 @@ class _McapEnd(McapFile):
 
     def __init__(self, path: Path, source: str) -> None:
         super().__init__(path, source)
-        self.offset = len(_MAGIC)
+        self.offset = len(MAGIC)
 
     def is_read(self) -> bool:
         """True where its writer has closed the file, and all of it was read."""
         with self._path.open("rb") as file:
             file.seek(self.offset)
-            return file.read() == _MAGIC
+            return file.read() == MAGIC
 
     def _records(self, wanted: Any) -> Iterator[Any]:
         """Records that are complete, those of chunks unpacked."""
@@ -299,9 +295,9 @@ class _McapEnd(McapFile):
 
 def _complete(data: bytes) -> int:
     """Number of the bytes of complete records."""
-    n = 0
-    while n + _HEAD <= len(data):
-        end = n + _HEAD + int(struct.unpack_from("<Q", data, n + 1)[0])
+    n, head = 0, 9  # of a record: its kind and length
+    while n + head <= len(data):
+        end = n + head + int(struct.unpack_from("<Q", data, n + 1)[0])
         if end > len(data):
             break
         n = end
@@ -389,7 +385,7 @@ class GrowingMcap(Growing):
         except LogError as error:
             self._waits, self._file = error, file
             return False
-        file.offset = len(_MAGIC)
+        file.offset = len(MAGIC)
         self._file, self._recording, self._waits = file, recording, None
         self._notes += notes
         return True
@@ -405,7 +401,8 @@ class GrowingMcap(Growing):
     def _rows(self, parts: Mapping[str, Samples]) -> dict[str, FloatArray] | None:
         """Rows of all topics, one after the other, on the stamps of the fastest; samples ahead of these wait."""
         parts = {name: _joined(self._ahead.pop(name), x) if name in self._ahead else x for name, x in parts.items()}
-        self._stamps = np.concatenate([self._stamps, parts[self._fastest].time])[-_RECENT:]
+        # Samples of other topics may belong to the last thousand: seconds, at any rate that is tracked.
+        self._stamps = np.concatenate([self._stamps, parts[self._fastest].time])[-1000:]
         if len(self._stamps) < 2:
             self._ahead = dict(parts)
             self._stamps = np.empty(0)
@@ -427,11 +424,9 @@ class GrowingMcap(Growing):
 
     def _placed(self, samples: Samples, apart: float) -> Samples:
         """Samples at the nearest stamp of the fastest topic, where one is near."""
-        after = np.clip(np.searchsorted(self._stamps, samples.time), 1, len(self._stamps) - 1)
-        before, behind = self._stamps[after - 1], self._stamps[after]
-        nearest = np.where(samples.time - before <= behind - samples.time, before, behind)
-        near = np.abs(nearest - samples.time) <= 0.5 * apart
-        return Samples(np.where(near, nearest, samples.time), samples.columns)
+        stamps = self._stamps[nearest(self._stamps, samples.time)]
+        near = np.abs(stamps - samples.time) <= 0.5 * apart
+        return Samples(np.where(near, stamps, samples.time), samples.columns)
 
 
 def _joined(before: Samples, samples: Samples) -> Samples:

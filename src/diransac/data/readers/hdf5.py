@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.data.readers.table import Table, check_shapes, table_of_arrays, undamaged
+from diransac.data.readers.table import Table, check_shapes, installed, table_of_arrays, undamaged
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
@@ -33,12 +33,8 @@ def read_hdf5(data: bytes, source: str, *, transposed: bool = False) -> Table:
 
     Raises LogError: h5py is missing; the file is damaged, larger than a log may be, or refers to other files.
     """
-    try:
+    with installed(f"{source}: HDF5 needs the package h5py"):
         import h5py
-    except ImportError as error:
-        raise LogError(
-            f'{source}: HDF5 needs the package h5py; install it with pip install "diransac[logs]"'
-        ) from error
     arrays: dict[str, npt.NDArray[Any]] = {}
     with undamaged(f"{source}: it is not an HDF5 file, or is damaged"), h5py.File(io.BytesIO(data), "r") as file:
         found = dict(_datasets(file, "", (), source, count(1)))

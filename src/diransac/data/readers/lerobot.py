@@ -25,7 +25,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.readers.parquet import is_numeric, numbers_of, scanned
-from diransac.data.readers.table import Table, check_size, check_unique
+from diransac.data.readers.table import Table, check_size, check_unique, readable
 from diransac.errors import LogError
 from diransac.limits import LARGEST_LOG, LARGEST_TABLE, MOST_COUNTED, beyond, read_bytes
 from diransac.plain_data import json_data, read_text
@@ -96,7 +96,7 @@ class LerobotDataset:
             counters = (_INDEX, "frame_index", "index", "task_index")
             kinds = {name: kind for name, kind in schema.items() if name not in counters}
             read = [name for name, kind in kinds.items() if is_numeric(kind) or self._is_vector(name, kind)]
-            counted = [name for name in ("frame_index",) if name in schema and is_numeric(schema[name])]
+            counted = ["frame_index"] if "frame_index" in schema and is_numeric(schema["frame_index"]) else []
             if _FILE.fullmatch(self.files[episode].name):
                 import polars as pl
 
@@ -108,7 +108,7 @@ class LerobotDataset:
             vectors = {
                 name: width if isinstance(width, str) else _matrix(frame[name], width) for name, width in widths.items()
             }
-            counts = numbers_of(frame[counted[0]]) if counted else np.arange(float(len(frame)))
+            counts = numbers_of(frame["frame_index"]) if counted else np.arange(float(len(frame)))
         left = {name: f"holds no short lists of numbers ({kinds[name]!s:.40})" for name in kinds if name not in read}
         pieces = [piece for name, values in vectors.items() for piece in self._columns(name, values)]
         columns: dict[str, FloatArray | str] = {name: values for name, values in pieces if name != "timestamp"}
@@ -162,13 +162,8 @@ class LerobotDataset:
     def _content(self, file: Path) -> bytes:
         """Bytes of a file; those of the last one are kept."""
         if self._last is None or self._last[0] != file:
-            named = f'{self.source}: "{self._inside(file).relative_to(self.folder)}"'
-            try:
+            with readable(f'{self.source}: "{self._inside(file).relative_to(self.folder)}"'):
                 self._last = file, read_bytes(file, LARGEST_LOG)
-            except ValueError as error:
-                raise LogError(f"{named}: {error}; split it") from error
-            except OSError as error:
-                raise LogError(f"{named} cannot be read: {error.strerror}") from error
         return self._last[1]
 
     def _episodes_in(self, file: Path) -> list[int]:
@@ -211,9 +206,8 @@ class LerobotDataset:
 
     def _time(self, stamps: FloatArray | str | None, counts: FloatArray) -> FloatArray | None:
         """Seconds of the rows; those of the rate where stamps agree to single precision, or are missing."""
-        fps = self._info.get("fps")
-        is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and 1e-6 < fps < 1e9
-        even: FloatArray | None = counts / float(fps) if is_rate else None  # type: ignore[arg-type]
+        fps: Any = self._info.get("fps")
+        even: FloatArray | None = counts / float(fps) if type(fps) in (int, float) and 1e-6 < fps < 1e9 else None
         if not isinstance(stamps, np.ndarray) or stamps.ndim != 1:
             return even
         if even is not None and len(even) and np.abs(stamps - even).max() <= 2.0**-22 * np.abs(even).max():

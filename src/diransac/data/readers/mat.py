@@ -25,7 +25,6 @@ from diransac.limits import LARGEST_LOG, MOST_COLUMNS, beyond
 
 _MATRIX, _COMPRESSED = 14, 15
 _CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_STRUCTURE, _COMPLEX = 2, 0x0800
 _CLASSES = {1: "a cell", 3: "an object", 4: "a text", 5: "a sparse matrix", 16: "a function", 17: "an object"}
 
 
@@ -114,19 +113,19 @@ def _arrays(content: memoryview, order: str, name: str, depth: int) -> Iterator[
         return
     elements = _Elements(content, order)
     flags = int(elements.numbers()[0])
-    kind = flags & 0xFF
+    kind, is_complex = flags & 0xFF, bool(flags & 0x0800)
     if kind == 17:  # MATLAB's own objects, without dimensions
         yield name or "object", np.array(_CLASSES[kind])
         return
     shape = tuple(int(n) for n in elements.numbers())
     own = elements.take()[1].tobytes().decode(errors="replace")
     name = name or own
-    if kind in range(6, 16) and not flags & _COMPLEX:
+    if kind in range(6, 16) and not is_complex:
         values = elements.numbers()
         if min(shape, default=-1) < 0 or math.prod(shape) != len(values):
             raise ValueError(f'"{name}" has {len(values)} numbers for the size {shape}')
         yield name, values.reshape(shape, order="F")
-    elif kind == _STRUCTURE and math.prod(shape) == 1 and depth < 8:
+    elif kind == 2 and math.prod(shape) == 1 and depth < 8:  # a structure
         yield from _fields(elements, order, name, depth)
     else:
         yield name, np.array(_CLASSES.get(kind, "an array of structures or of complex numbers"))

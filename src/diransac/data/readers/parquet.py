@@ -68,12 +68,12 @@ def scanned(data: bytes, source: str) -> Iterator[tuple[pl.LazyFrame, pl.Schema]
         with silenced():  # Polars prints where it panics
             lazy = pl.scan_parquet(io.BytesIO(data))
             schema = lazy.collect_schema()
-            numbers = sum(_declared(data)) if any(kind.is_nested() for kind in schema.values()) else None
+            numbers = sum(_declared(data, source)) if any(kind.is_nested() for kind in schema.values()) else None
             check_size(source, lazy.select(pl.len()).collect().item(), len(schema), numbers)
             yield lazy, schema
     except pl.exceptions.PanicException as error:
         raise LogError(f"{source}: the Parquet data are damaged; write the file again") from error
-    except (pl.exceptions.PolarsError, OSError, MemoryError, _FooterError) as error:
+    except (pl.exceptions.PolarsError, OSError, MemoryError) as error:
         reason = f"{error!s:.200}".partition("\n")[0]
         raise LogError(f"{source}: the Parquet data are damaged ({reason})") from error
 
@@ -114,14 +114,10 @@ def _first(series: pl.Series) -> str:
 # ---------------------------------------------------------------------- footer
 
 
-class _FooterError(ValueError):
-    """The footer is damaged."""
-
-
-def _declared(data: bytes) -> list[int]:
+def _declared(data: bytes, source: str) -> list[int]:
     """Numbers of values in the parts of a file, by its footer: a row of a list may have any number of them.
 
-    Raises _FooterError: it cannot be read.
+    Raises LogError: it cannot be read.
 
     References: Apache Parquet, parquet.thrift; Apache Thrift, "Thrift Compact protocol".
     """
@@ -131,7 +127,7 @@ def _declared(data: bytes) -> list[int]:
         footer = _Compact(data[max(4, len(data) - 8 - size) : -8]).structure(0)
         return [int(x[about][n_values]) for group in footer[row_groups] for x in group[chunks]]
     except (IndexError, KeyError, TypeError, ValueError) as error:
-        raise _FooterError("its footer cannot be read") from error
+        raise LogError(f"{source}: the Parquet data are damaged (its footer cannot be read)") from error
 
 
 class _Compact:

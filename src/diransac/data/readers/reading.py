@@ -13,9 +13,9 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.checks import check_clock, check_names
-from diransac.data.clock import Gridded, in_order, is_even, on_own_grid, runs_freely
+from diransac.data.clock import Aligned, in_order, is_even, on_own_grid, runs_freely
 from diransac.data.log import Log
-from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resample_columns
+from diransac.data.preprocessing.steps import check_factor, origins_of, rename_columns, resampled
 from diransac.data.readers.recording import Recording, Samples
 from diransac.data.readers.repair import Repairs
 from diransac.data.readers.table import Table, seconds, time_column, unit_of_name
@@ -106,7 +106,7 @@ class Reading:
         if unmeasured:
             table = table.with_step({"step": "unmeasured", "signals": list(unmeasured)})
         log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
-        log = preprocessing.prepared(log, {} if mapping is None else mapping.preparation)
+        log = log if mapping is None else preprocessing.prepared(log, mapping.preparation)
         spiky = [name for name in earlier.despike if name in log]
         delays = {name: x for name, x in earlier.shift.items() if name in log}
         return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
@@ -124,11 +124,10 @@ class Reading:
         table, _ = self._table(opened, earlier, self._chosen("columns", earlier), Repairs(), source)
         if opened.times and not table.times:
             raise LogError(f"{source}: its time is that of a calendar, which cannot be followed; give seconds")
-        factors = {**earlier._factors(table), **self.scale}
-        time, _ = seconds(table, factors, source)
+        table = table.scaled({**earlier._factors(table), **self.scale})
+        time, _ = seconds(table, source)
         signals, _ = _signals(table, len(time), source)
-        units = {n: unit for n, unit in table.units.items() if n in signals and abs(factors.get(n, 1.0)) == 1.0}
-        return {"t": time, **{n: x * factors.get(n, 1.0) for n, x in signals.items()}}, units
+        return {"t": time, **signals}, {name: unit for name, unit in table.units.items() if name in signals}
 
     def topics(self, like: Sequence[Mapping[str, Any]]) -> tuple[LogMapping | None, dict[str, str]]:
         """Mapping, and new names by ``topic.field``, of a recording."""
@@ -218,57 +217,40 @@ _ARGUMENTS: dict[str, Any] = {
 # From a table to a log ------------------------------------------------------------------------------------------------
 def _log(table: Table, scale: Mapping[str, float], resample: float | str | None, repairs: Repairs, source: str) -> Log:
     """Log of a table: scaled, repaired, resampled and checked."""
-    history: list[dict[str, Any]] = list(table.history)
-    factors = {name: float(factor) for name, factor in scale.items()}
-    for name, factor in factors.items():
-        check_factor(name, factor)
-    time, converted = seconds(table, factors, source)
+    for name, factor in scale.items():
+        check_factor(name, float(factor))
+    table = table.scaled({name: float(factor) for name, factor in scale.items()})
+    time, converted = seconds(table, source)
     signals, unusable = _signals(table, len(time), source)
-    for name in factors:
+    for name in scale:
         if name != "t" and name not in signals:
             raise LogError(f'{source}: there is no signal "{name}" to scale; found {", ".join(table.columns)}')
-    if factors:
-        signals = {n: x * factors.get(n, 1.0) for n, x in signals.items()}
-        units = {name: table.units[name] for name in factors if name in table.units}
-        history.append({"step": "scale", "factors": factors, **({"units": units} if units else {})})
     ordered = repairs.ordered(Samples(time, signals), "")
-    time, signals = ordered.time, dict(ordered.columns)
-    rows = in_order(time, source)
-    unstated = "t" not in factors and "t" not in table.units and not table.is_described
-    notes = [*table.notes, *([converted] if converted else []), *check_clock(time[rows], source, in_file=unstated)]
-    gridded, resample = _gridded(time, signals, resample, repairs, source)
-    if repairs.step is not None:
-        history.append(repairs.step)
-        notes += repairs.notes
-    if gridded is not None:
-        time, signals, recorded = gridded.time, dict(gridded.signals), gridded.recorded
-        history += [] if gridded.step is None else [gridded.step]
-        notes += gridded.notes
-    elif resample is not None:
-        columns = {name: x[rows] for name, x in signals.items()}
-        time, signals, step, said = resample_columns(time[rows], columns, resample, source)
-        history.append(step)
-        recorded, notes = np.ones(len(time), bool), [*notes, *said]
-    units = {n: unit for n, unit in table.units.items() if abs(factors.get(n, 1.0)) == 1.0}
-    log = Log(time, signals, units, source, tuple(history), unusable=unusable, filter=table.filter)
-    return replace(log, notes=tuple(dict.fromkeys((*notes, *log.findings(recorded)))))
+    stamps = ordered.time[in_order(ordered.time, source)]
+    unstated = "t" not in table.units and not table.is_described
+    notes = [*table.notes, *([converted] if converted else []), *check_clock(stamps, source, in_file=unstated)]
+    made = _on_even_clock(ordered, resample, repairs, source)
+    history = (*table.history, *([] if repairs.step is None else [repairs.step]), *made.steps)
+    log = Log(made.time, made.signals, table.units, source, history, unusable=unusable, filter=table.filter)
+    notes += (*repairs.notes, *made.notes, *log.findings(made.recorded))
+    return replace(log, notes=tuple(dict.fromkeys(notes)))
 
 
-def _gridded(
-    time: FloatArray, signals: Mapping[str, FloatArray], resample: float | str | None, repairs: Repairs, source: str
-) -> tuple[Gridded | None, float | str | None]:
-    """Columns on the log's own grid, or the rate at which they are resampled.  Raises LogError: neither is known."""
-    if resample is not None:
-        return None, resample
-    if "clock" in repairs and not is_even(time):
+def _on_even_clock(samples: Samples, resample: float | str | None, repairs: Repairs, source: str) -> Aligned:
+    """Columns on the log's own grid, or resampled.  Raises LogError: they have no grid, and no rate is known."""
+    time = samples.time
+    if resample is None and "clock" in repairs and not is_even(time):
         repairs.record("clock", "the clock is uneven")
-        return None, "median"
-    try:
-        return on_own_grid(time, signals, source), None
-    except LogError:
-        if not runs_freely(time[in_order(time, source)]):
-            raise
-    return None, "median"
+        resample = "median"
+    if resample is None:
+        try:
+            return on_own_grid(time, samples.columns, source)
+        except LogError:
+            if not runs_freely(time[in_order(time, source)]):
+                raise
+        resample = "median"
+    rows = in_order(time, source)
+    return resampled(time[rows], {name: x[rows] for name, x in samples.columns.items()}, resample, source)
 
 
 def _with_clock(table: Table, rate: float | None, source: str) -> Table:
@@ -279,8 +261,7 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
         raise SettingsError(f"the rate of a log without time is {rate}; give Hz")
     if "t" in table.columns:
         raise LogError(f"{source}: it has a time column; leave out the rate of {rate:.6g} Hz")
-    n = max((len(x) for x in table.columns.values() if not isinstance(x, str)), default=0)
-    columns: dict[str, FloatArray | str] = {"t": np.arange(n) / rate, **table.columns}
+    columns: dict[str, FloatArray | str] = {"t": np.arange(table.n_rows) / rate, **table.columns}
     clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
     return clocked.with_step({"step": "clock", "rate": float(rate)})
 
@@ -309,9 +290,8 @@ def _renamed(table: Table, names: Mapping[str, str], source: str) -> Table:
 
 def _signals(table: Table, n: int, source: str) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Columns that are as long as the time, and for the others the reason why they are no signals."""
-    columns = {name: column for name, column in table.columns.items() if name != "t"}
-    check_names(columns, source)
-    unusable = {name: column for name, column in columns.items() if isinstance(column, str)}
-    numbers = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    check_names([name for name in table.columns if name != "t"], source)
+    unusable = {name: column for name, column in table.columns.items() if isinstance(column, str)}
+    numbers = {name: x for name, x in table.numbers.items() if name != "t"}
     unusable |= {m: f"has {len(x)} value{'s' * (len(x) != 1)}, the time {n}" for m, x in numbers.items() if len(x) != n}
     return {name: x for name, x in numbers.items() if len(x) == n}, unusable

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import FloatArray
-from diransac.data.checks import check_time_order
+from diransac.arrays import FloatArray, IntArray
+from diransac.data.checks import ROUNDING, check_time_order
+from diransac.data.clock import Aligned
 from diransac.data.preprocessing.steps import describe_resampling, interpolate_at, resampling_grid
 from diransac.errors import LogError
 from diransac.text_table import some
@@ -97,8 +98,13 @@ class Recording:
             raise LogError(f'{self.source}: there is no topic "{topic}"; found {", ".join(self.fields)}')
         for label in fields:
             if label not in self.fields[topic]:
-                listed = ", ".join(self.fields[topic])
-                raise LogError(f'{self.source}: topic "{topic}" has no field "{label}"; it has {listed}')
+                raise self.lacking(topic, label)
+
+    def lacking(self, topic: str, label: str) -> LogError:
+        """Error of a topic that has no such field."""
+        return LogError(
+            f'{self.source}: topic "{topic}" has no field "{label}"; it has {", ".join(self.fields[topic])}'
+        )
 
 
 def seconds_since(origin: int, nanoseconds: npt.NDArray[np.int64]) -> FloatArray:
@@ -159,16 +165,6 @@ def _together(whole: str, kind: str, parts: list[str]) -> str:
 # ---------------------------------------------------------------------- one clock
 
 
-@dataclass(frozen=True)
-class Aligned:
-    """Signals of several clocks on one: time (N,), signals (N,), what was done, and sentences about it."""
-
-    time: FloatArray
-    signals: dict[str, FloatArray]
-    step: dict[str, Any] | None
-    notes: list[str]
-
-
 def align(parts: Mapping[str, Samples], rate: float | str | None, source: str) -> Aligned:
     """Signals of several topics on the clock of one; no sample is invented.
 
@@ -201,17 +197,18 @@ def align(parts: Mapping[str, Samples], rate: float | str | None, source: str) -
     reference = parts[fastest]
     signals: dict[str, FloatArray] = {}
     if rate is None:
-        time, step, hertz = reference.time, None, None
+        time, steps, hertz = reference.time, list[dict[str, Any]](), None
         notes = [f'rows are those of topic "{fastest}"']
     else:
         time, hertz = resampling_grid(reference.time, rate, source)
         step, notes = describe_resampling(reference.time, time, hertz)
+        steps = [step]
         notes.insert(0, ", ".join(f'"{topic}" at {1.0 / x.interval:.4g} Hz' for topic, x in parts.items()))
     for topic, samples in parts.items():
         columns, said = _on_rows(samples, time, hertz, topic)
         signals |= columns
         notes += said
-    return Aligned(time, signals, step, notes)
+    return Aligned(time, signals, steps=tuple(steps), notes=tuple(notes))
 
 
 def _on_rows(
@@ -225,12 +222,17 @@ def _on_rows(
     return _nearest_rows(samples, time, float(np.median(np.diff(time))), topic)
 
 
+def nearest(time: FloatArray, stamps: FloatArray) -> IntArray:
+    """Index (n,) of the nearest of two or more ascending times for each stamp; of two that are as near, the first."""
+    after = np.clip(np.searchsorted(time, stamps), 1, len(time) - 1)
+    return np.where(stamps - time[after - 1] <= time[after] - stamps, after - 1, after)
+
+
 def _nearest_rows(samples: Samples, time: FloatArray, dt: float, topic: str) -> tuple[dict[str, FloatArray], list[str]]:
     """Columns with each sample in the nearest row; of two samples of one row, the nearer; NaN elsewhere."""
-    after = np.clip(np.searchsorted(time, samples.time), 1, len(time) - 1)
-    row = np.where(samples.time - time[after - 1] <= time[after] - samples.time, after - 1, after)
+    row = nearest(time, samples.time)
     moved = np.abs(time[row] - samples.time)
-    inside = moved <= dt * (0.5 + 1e-6)
+    inside = moved <= dt * (0.5 + ROUNDING)
     order = np.lexsort((moved, row))
     first = order[np.r_[True, np.diff(row[order]) > 0]]
     kept = np.sort(first[inside[first]])

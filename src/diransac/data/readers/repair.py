@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.data.readers.recording import Samples
 from diransac.data.units import conversion
-from diransac.errors import LogError, SettingsError
+from diransac.errors import SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -108,8 +108,3 @@ class Repairs:
         if changed:
             self.record("units", ", ".join(changed))
         return replace(table, columns=columns, units=units)
-
-    def check_share(self, n_bad: int, n: int, what: str, source: str) -> None:
-        """Raise LogError if more than 1 in 100 are bad, and more than one."""
-        if n_bad > max(1, n // 100):
-            raise LogError(f"{source}: {n_bad} of {n} {what}: too many to repair (1 in 100)")

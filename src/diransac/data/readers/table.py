@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
@@ -42,6 +41,15 @@ def undamaged(what: str, errors: tuple[type[Exception], ...] = DAMAGE) -> Iterat
     except errors as error:
         why = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise LogError(f"{what} ({why:.150})") from error
+
+
+@contextmanager
+def installed(what: str) -> Iterator[None]:
+    """Context of imports from packages of the extra logs.  Raises LogError: one is missing; ``what`` needs it."""
+    try:
+        yield
+    except ImportError as error:
+        raise LogError(f'{what}; pip install "diransac[logs]"') from error
 
 
 @contextmanager
@@ -90,9 +98,30 @@ class Table:
     times: Mapping[str, FloatArray] = field(default_factory=dict)
     elements: tuple[str, ...] = ()
 
+    @property
+    def numbers(self) -> dict[str, FloatArray]:
+        """Columns that hold numbers."""
+        return {name: x for name, x in self.columns.items() if not isinstance(x, str)}
+
+    @property
+    def n_rows(self) -> int:
+        """Length of the longest column of numbers."""
+        return max(map(len, self.numbers.values()), default=0)
+
     def with_step(self, step: Mapping[str, Any]) -> Table:
         """The table with one more step in its history."""
         return replace(self, history=(*self.history, dict(step)))
+
+    def scaled(self, factors: Mapping[str, float]) -> Table:
+        """The table with columns times factors, the time then in seconds; no unit where the magnitude changes."""
+        if not factors:
+            return self
+        columns = {**self.columns, **{name: x * factors[name] for name, x in self.numbers.items() if name in factors}}
+        before = {name: self.units[name] for name in factors if name in self.units}
+        units = {name: unit for name, unit in self.units.items() if abs(factors.get(name, 1.0)) == 1.0}
+        units |= {"t": "s"} if "t" in factors else {}
+        step = {"step": "scale", "factors": dict(factors), **({"units": before} if before else {})}
+        return replace(self, columns=columns, units=units).with_step(step)
 
     def with_time_of(self, name: str) -> Table:
         """The table in which a column with times of the calendar is seconds since the first."""
@@ -215,8 +244,7 @@ def time_column(table: Table, taken: Container[str]) -> str | None:
     """
     if "t" in table.columns:
         return None
-    numeric = [name for name, x in table.columns.items() if isinstance(x, np.ndarray)]
-    for kind in (numeric, table.times):
+    for kind in (table.numbers, table.times):
         found = [name for name in kind if _NAME.fullmatch(name) and name not in taken]
         if found:
             return found[0] if len(found) == 1 else None
@@ -229,7 +257,7 @@ def unit_of_name(name: str) -> str | None:
     return _UNIT_OF_ENDING[match["unit"].lower()] if match and match["unit"] else None
 
 
-def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[FloatArray, str]:
+def seconds(table: Table, source: str) -> tuple[FloatArray, str]:
     """Column ``t`` (N,) of a table in seconds, and a sentence on a conversion from its unit, empty without one.
 
     Raises LogError: there is no such column, or it holds no numbers.
@@ -241,8 +269,6 @@ def seconds(table: Table, factors: Mapping[str, float], source: str) -> tuple[Fl
     time = table.columns["t"]
     if isinstance(time, str):
         raise LogError(f'{source}: the time column "t" {time}')
-    if "t" in factors:
-        return time * factors["t"], ""
     unit = table.units.get("t", "s")
     factor = conversion(unit, "s")
     if factor in (None, 1.0):

@@ -40,15 +40,15 @@ def mapped_table(table: Table, mapping: LogMapping, source: str) -> Table:
     entries, notes = mapping.chosen({"": list(columns)}, {"": table.elements}, source)
     mapped: dict[str, FloatArray | str] = {"t": columns["t"]} if "t" in columns else {}
     units = {"t": "s"} if mapping.time_column is not None else {n: x for n, x in table.units.items() if n == "t"}
+    numbers = {name: x for name, x in columns.items() if not isinstance(x, str)}
     for entry in entries:
-        texts = {name: columns[name] for name in entry.needs if isinstance(columns[name], str)}
-        for name, why in texts.items():
-            raise LogError(f'{source}: column "{name}" {why}')
-        mapped |= entry.apply({name: x for name, x in columns.items() if not isinstance(x, str)})
+        for name in entry.needs:
+            if name not in numbers:
+                raise LogError(f'{source}: column "{name}" {columns[name]}')
+        mapped |= entry.apply(numbers)
         units |= entry.known_units()
-    numeric = {name: x for name, x in columns.items() if not isinstance(x, str)}
-    events = [x for x in mapping.events_in({"": list(numeric)}) if not x.topic]
-    mapped |= {x.name: x.flags(numeric) for x in events}
+    events = [x for x in mapping.events_in({"": list(numbers)}) if not x.topic]
+    mapped |= {x.name: x.flags(numbers) for x in events}
     step = {"step": "map", "mapping": mapping.source, "text": mapping.text, "signals": _origins(entries)}
     step |= {"events": [x.name for x in events]} if events else {}
     made = replace(table, columns=mapped, units=units, notes=(*table.notes, *notes), filter=None)
@@ -100,12 +100,11 @@ def table_of_topics(
     step |= {"log": {name: information[name] for name in kept if name in information}} if information else {}
     flags = {} if mapping is None else _flags(recording, mapping, made.time)
     step |= {"events": list(flags)} if flags else {}
-    history = (step,) if made.step is None else (step, made.step)
     said = (*recording.notes, *notes, *(made.notes if len(parts) > 1 else ()))
     unusable = {name: why for samples in parts.values() for name, why in samples.unusable.items()}
-    return Table({"t": made.time, **made.signals, **unusable, **flags}, units | {"t": "s"}, said, history), None if len(
-        parts
-    ) > 1 else resample
+    columns: dict[str, FloatArray | str] = {"t": made.time, **made.signals, **unusable, **flags}
+    table = Table(columns, units | {"t": "s"}, said, (step, *made.steps))
+    return table, None if len(parts) > 1 else resample
 
 
 def entries_of(
@@ -268,16 +267,14 @@ def list_topics(recording: Recording) -> TopicTable:
     """Topics of a recording, with their rates and gaps."""
     fields = recording.fields
     read = recording.read(dict.fromkeys(fields, ()), "message")
-    topics = {
-        name: replace(_facts(read[name].time, fields[name]), texts=recording.texts.get(name, ())) for name in fields
-    }
+    topics = {name: _facts(read[name].time, own, recording.texts.get(name, ())) for name, own in fields.items()}
     return TopicTable(recording.source, topics, recording.notes, recording.metadata, recording.elements)
 
 
-def _facts(time: FloatArray, fields: tuple[str, ...]) -> TopicFacts:
+def _facts(time: FloatArray, fields: tuple[str, ...], texts: tuple[str, ...]) -> TopicFacts:
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else np.nan
     n_gaps = int((steps > 3.5 * usual).sum()) if usual > 0.0 else 0
     longest = float(steps.max()) if len(steps) else np.nan
     rate = 1.0 / usual if usual > 0.0 else np.nan
-    return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields)
+    return TopicFacts(len(time), rate, float(time[0]), float(time[-1]), n_gaps, longest, fields, texts)

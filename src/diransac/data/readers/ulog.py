@@ -31,11 +31,7 @@ _TYPES = {
     "bool": "<u1",
     "char": "<u1",
 }
-_NANOSECONDS, _LATEST_START = 1000, 60_000_000
-_LARGEST_RECORD, _DEEPEST = 0xFFFF, 8
-_MOST_DAMAGES, _SEARCHED = 100, 1 << 20
-_MOST_TEXTS = 1000
-_ROWS_AT_ONCE = 1 << 16
+_LARGEST_RECORD, _MOST_TEXTS = 0xFFFF, 1000
 
 
 @dataclass
@@ -101,7 +97,7 @@ class UlogRecording(Recording):
                 damages += 1
                 self._doubt_last()
                 at = self._resume(at + 1)
-                if damages > _MOST_DAMAGES or at < 0:
+                if damages > 100 or at < 0:  # the rest is no ULog
                     return
                 continue
             if after > end:
@@ -131,7 +127,7 @@ class UlogRecording(Recording):
         """Place of the next mark or message that is plausible, -1 where there is none."""
         data, end = self._data, len(self._data)
         mark = data.find(b"\x08\x00S\x2f\x73\x13\x20\x25\x0c\xbb\x12", at)
-        last = min(end, at + _SEARCHED) if mark < 0 else mark
+        last = min(end, at + (1 << 20)) if mark < 0 else mark  # without a mark, a megabyte is searched
         for place in range(at, last - 5):
             if data[place + 2] == ord("D"):
                 size, _ = _HEADER.unpack_from(data, place)
@@ -168,8 +164,6 @@ class UlogRecording(Recording):
         name = content[3:].decode()
         if number in self._subscriptions:
             return
-        if name not in self._formats:
-            raise ValueError(name)
         layout, size = self._layout(name)
         names = list(layout)
         while names and names[-1].startswith("_padding"):  # trailing padding is not written
@@ -181,18 +175,19 @@ class UlogRecording(Recording):
 
     def _layout(self, name: str, depth: int = 0) -> tuple[dict[str, tuple[str, int]], int]:
         """Type and offset of every field of a format, nested ones by dotted names, and the size of a record."""
+        if name not in self._formats or depth > 8:
+            raise ValueError("there is no such format, or formats contain each other")
         layout: dict[str, tuple[str, int]] = {}
         size = 0
-        if depth > _DEEPEST:
-            raise ValueError("formats contain each other")
         for text in filter(None, self._formats[name].split(";")):
             match = re.fullmatch(r"(\w+)(?:\[(\d{1,5})\])? (\w+)", text)
             if match is None:
                 raise ValueError(text)
             kind, count, label = match.groups()
-            inner, step = (
-                ({"": (_TYPES[kind], 0)}, int(_TYPES[kind][2])) if kind in _TYPES else self._inner(kind, depth)
-            )
+            if kind in _TYPES:
+                inner, step = {"": (_TYPES[kind], 0)}, int(_TYPES[kind][2])
+            else:
+                inner, step = self._layout(kind, depth + 1)
             repeats = int(count or 1)
             if size + repeats * step > _LARGEST_RECORD or repeats * len(inner) > _LARGEST_RECORD:
                 raise ValueError("a record is too large")
@@ -202,11 +197,6 @@ class UlogRecording(Recording):
                     layout[f"{prefix}.{rest}" if rest else prefix] = (code, size + offset)
                 size += step
         return layout, size
-
-    def _inner(self, kind: str, depth: int) -> tuple[dict[str, tuple[str, int]], int]:
-        if kind not in self._formats:
-            raise ValueError(kind)
-        return self._layout(kind, depth + 1)
 
     def _take_information(self, content: bytes) -> None:
         kind, name, value = _keyed(content)
@@ -224,9 +214,6 @@ class UlogRecording(Recording):
         if len(self.metadata["messages"]) < _MOST_TEXTS:
             self.metadata["messages"].append([stamp / 1e6, content[at + 8 :].decode(errors="replace")])
 
-    def _take_tagged_text(self, content: bytes) -> None:
-        self._take_text(content, 3)
-
     def _take_dropout(self, content: bytes) -> None:
         self.metadata["dropouts"].append(struct.unpack("<H", content)[0] / 1e3)
 
@@ -242,10 +229,10 @@ class UlogRecording(Recording):
         return named
 
     def _first_time(self) -> int:
-        """Start of the log in microseconds: the header's, or that of most topics if this is far from it."""
+        """Start of the log, µs: the header's, or that of most topics if that is not in the minute after it."""
         firsts = [int(self._column(topic, "timestamp", topic.places[:1])[0]) for topic in self._topics.values()]
         usual = sorted(firsts)[len(firsts) // 2]
-        return self._start if 0 <= usual - self._start < _LATEST_START else usual
+        return self._start if 0 <= usual - self._start < 60_000_000 else usual
 
     def _say_what_is_missing(self) -> None:
         dropouts = self.metadata["dropouts"]
@@ -276,7 +263,7 @@ class UlogRecording(Recording):
         latest = 1 << 53
         since = np.minimum(times, np.uint64(latest)).astype(np.int64) - min(self._start, latest)
         columns = {label: as_doubles(self._column(topic, label, topic.places)) for label in fields}
-        return Samples(seconds_since(0, since * _NANOSECONDS), columns)
+        return Samples(seconds_since(0, 1000 * since), columns)
 
     def _column(self, topic: _Topic, label: str, places: array[int]) -> npt.NDArray[Any]:
         """One field (n,) of the records at some places."""
@@ -285,9 +272,9 @@ class UlogRecording(Recording):
         data = np.frombuffer(self._data, dtype=np.uint8)
         at = np.frombuffer(places, dtype=np.uint64).astype(np.int64) + offset
         column = np.empty(len(at), dtype=kind)
-        for first in range(0, len(at), _ROWS_AT_ONCE):
-            rows = at[first : first + _ROWS_AT_ONCE, None] + np.arange(kind.itemsize)
-            column[first : first + _ROWS_AT_ONCE] = data[rows].view(kind)[:, 0]
+        for first in range(0, len(at), 1 << 16):  # their places take eight times the memory of the bytes
+            part = slice(first, first + (1 << 16))
+            column[part] = data[at[part, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
         return column
 
 
@@ -304,6 +291,6 @@ _TAKERS = {
     ord("I"): UlogRecording._take_information,
     ord("P"): UlogRecording._take_parameter,
     ord("L"): UlogRecording._take_text,
-    ord("C"): UlogRecording._take_tagged_text,
+    ord("C"): lambda log, content: log._take_text(content, 3),  # which has a tag
     ord("O"): UlogRecording._take_dropout,
 }

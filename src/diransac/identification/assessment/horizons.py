@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, runs
 from diransac.data.dataset import Dataset, ParameterLayout
-from diransac.data.segment import Segment, runs
+from diransac.data.segment import Segment
 from diransac.errors import LogError
 from diransac.identification.assessment.window_starts import SmoothedLog, WindowStarts
 from diransac.identification.diagnosis import Resolution

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, runs
 from diransac.data.dataset import Dataset
-from diransac.data.segment import Segment, runs
+from diransac.data.segment import Segment
 from diransac.errors import LogError
 from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.estimate import Estimate, Evaluation, Prediction

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, runs
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
-from diransac.data.segment import Segment, runs
+from diransac.data.segment import Segment
 from diransac.errors import LogError, SettingsError
 from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.estimate import Estimate, Evaluation

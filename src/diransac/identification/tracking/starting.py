@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, long_runs
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
-from diransac.data.segment import long_runs
 from diransac.errors import DiransacError
 from diransac.identification.identify import identify
 from diransac.identification.methods.lo_diransac import LoDiransac

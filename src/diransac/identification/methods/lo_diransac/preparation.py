@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
-from diransac.data.segment import long_runs, silent_rows
+from diransac.arrays import FloatArray, long_runs
+from diransac.data.segment import silent_rows
 from diransac.errors import LogError
 from diransac.identification.methods.lo_diransac.screening import (
     odd_window,
