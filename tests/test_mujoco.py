@@ -283,14 +283,6 @@ def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: f
     assert str(result.verdict) == ("usable with care" if late else "usable")
 
 
-def test_the_same_seed_gives_the_same_answer(
-    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result]
-) -> None:
-    settings = dr.Settings(threads=1)
-    again = dr.identify(linkage[0], four_bar[1], settings=settings)
-    assert again.parameters == linkage[1].parameters
-
-
 @pytest.mark.parametrize(
     "option", [{"horizon": 0.5}, {"with_suggestions": True}, {"method": dr.LoDiransac(substeps=9)}]
 )
@@ -345,7 +337,7 @@ def test_a_stored_model_that_names_files_is_refused(linkage: tuple[MujocoModel, 
         MujocoModel.from_dict(json.loads(json.dumps(data)))
 
 
-def test_the_command_line_does_the_same(
+def test_the_command_line_gives_the_same_numbers(
     four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], tmp_path: Path
 ) -> None:
     path, log = four_bar
@@ -353,8 +345,7 @@ def test_the_command_line_does_the_same(
     arguments = ["--model", str(path), "--simulator", "mujoco", "--unknown", "joint/crank.armature,body/coupler.mass"]
     done = run("identify", str(tmp_path / "log.csv"), *arguments, "-o", str(tmp_path / "a.json"), "--json")
     assert done.exit_code == 0, done.stderr
-    found = json.loads(done.stdout)["parameters"]
-    assert found["body/coupler.mass"] == pytest.approx(linkage[1].parameters["body/coupler.mass"], rel=1e-3)
+    assert json.loads(done.stdout)["parameters"] == linkage[1].parameters  # it is the same seed, too
     for more, said in ((["--simulator", "gazebo"], "there is mujoco"), (["--simulator", "mujoco"], "needs --unknown")):
         refused = run("identify", str(tmp_path / "log.csv"), "--model", str(path), *more)
         assert refused.exit_code == 2
