@@ -99,7 +99,7 @@ def four_bar(folder: Path) -> tuple[Path, dr.Log]:
     names = {n: (lambda d, k=k: d.qpos[k], 5e-4) for n, k in joints.items()}
     names |= {f"{n}_dot": (lambda d, k=k: d.qvel[k], 0.02) for n, k in joints.items()}
     log = recorded(
-        FOUR_BAR.format(a=0.006, m=0.5), lambda t: 0.6 * np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t), 4.0, names, 1
+        FOUR_BAR.format(a=0.006, m=0.5), lambda t: 0.6 * np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t), 2.0, names, 1
     )
     return path, log
 
@@ -267,8 +267,8 @@ CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
 @pytest.mark.parametrize(("mass", "late"), [(30.0, 0), (0.5, -3)])
 def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: float, late: int) -> None:
     machine = mujoco.MjModel.from_xml_string(CART.format(m=1.0, d=2.0))
-    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(2000)
-    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((2000, 2))
+    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(1000)
+    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((1000, 2))
     for k, u in enumerate(force):
         motion[k] = data.qpos[0], data.qvel[0]
         data.ctrl[0] = u
