@@ -1,7 +1,7 @@
 """Machines of the built-in models, simulated independently: NumPy, Runge-Kutta, physical parameters.
 
 Masses, lengths and inertias of the parts are those of a drawing, from which the parameters of the models follow; mass
-matrices are solved as linear systems, forces summed wheel by wheel and rotor by rotor.  Nothing is shared with the
+matrices are inverted as linear systems, forces summed wheel by wheel and rotor by rotor.  Nothing is shared with the
 package but `Log`.
 """
 
@@ -98,11 +98,12 @@ def cart_pole_rates(x, u):
     """Lagrange's equations of cart and rod, with the centre of the rod at half of its length."""
     _, angle, speed, rate = x
     arm = LENGTH / 2
-    coupling = POLE * arm * np.cos(angle)
-    M = np.array([[CART + POLE, coupling], [coupling, POLE * LENGTH**2 / 3]])
+    mass, coupling, inertia = CART + POLE, POLE * arm * np.cos(angle), POLE * LENGTH**2 / 3
     along = u[0] - CART_FRICTION * speed + POLE * arm * rate**2 * np.sin(angle)
     across = -POLE * G * arm * np.sin(angle) - POLE_FRICTION * rate
-    return np.array([speed, rate, *np.linalg.solve(M, [along, across])])
+    determinant = mass * inertia - coupling**2
+    turning = (mass * across - coupling * along) / determinant
+    return np.array([speed, rate, (inertia * along - coupling * across) / determinant, turning])
 
 
 def cart_pole_law(t, x):
@@ -191,6 +192,17 @@ DRIVE = {
 }
 
 
+ROLLING = WHEEL_INERTIA / RADIUS
+CHASSIS_AND_WHEELS = np.linalg.inv(
+    [
+        [CHASSIS, 0.0, -1.0, -1.0],
+        [0.0, CHASSIS_INERTIA + CHASSIS * AHEAD**2, TRACK / 2, -TRACK / 2],
+        [ROLLING, -ROLLING * TRACK / 2, RADIUS, 0.0],
+        [ROLLING, ROLLING * TRACK / 2, 0.0, RADIUS],
+    ]
+)
+
+
 def drive_rates(x, torques):
     """Chassis and wheels with the forces between them as unknowns, and rolling as further equations.
 
@@ -200,16 +212,7 @@ def drive_rates(x, torques):
     spins = np.array([speed - TRACK / 2 * rate, speed + TRACK / 2 * rate]) / RADIUS
     driven = torques - WHEEL_FRICTION * spins - WHEEL_DRY_FRICTION * np.sign(spins)
     lateral = CHASSIS * (speed * rate)  # of the axle, plus CHASSIS * AHEAD times the yaw acceleration
-    rolling = WHEEL_INERTIA / RADIUS
-    A = np.array(
-        [
-            [CHASSIS, 0.0, -1.0, -1.0],
-            [0.0, CHASSIS_INERTIA + CHASSIS * AHEAD**2, TRACK / 2, -TRACK / 2],
-            [rolling, -rolling * TRACK / 2, RADIUS, 0.0],
-            [rolling, rolling * TRACK / 2, 0.0, RADIUS],
-        ]
-    )
-    along, turning, *_ = np.linalg.solve(A, [CHASSIS * AHEAD * rate**2, -lateral * AHEAD, *driven])
+    along, turning, *_ = CHASSIS_AND_WHEELS @ (CHASSIS * AHEAD * rate**2, -lateral * AHEAD, *driven)
     return np.array([speed * np.cos(yaw), speed * np.sin(yaw), rate, along, turning])
 
 

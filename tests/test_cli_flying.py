@@ -43,16 +43,17 @@ def clean_log() -> dr.Log:
     return dr.fly(plant, trajectory, dr.tvlqr(plant, trajectory))
 
 
-def identified(log: dr.Log, model: dr.Model | None = None) -> dr.Result:
-    result = dr.identify(model or dr.models.planar_rotorcraft(), log, method="ols")
-    result.save("model.json")
-    return result
+@pytest.fixture(scope="module")
+def found(clean_log: dr.Log) -> dr.Result:
+    """What least squares finds in that log."""
+    return dr.identify(dr.models.planar_rotorcraft(), clean_log, method="ols")
 
 
 @pytest.fixture
-def result(folder: Path, clean_log: dr.Log) -> dr.Result:
-    """What least squares finds in that log, saved as ``model.json``."""
-    return identified(clean_log)
+def result(folder: Path, found: dr.Result) -> dr.Result:
+    """The same, saved as ``model.json``."""
+    found.save("model.json")
+    return found
 
 
 # ---------------------------------------------------------------- simulate
@@ -240,7 +241,7 @@ def test_fly_knows_table_i_for_the_paper_s_equations_under_any_name(
 
 
 def test_fly_takes_a_model_with_other_equations_for_the_same_machine_and_says_so(folder: Path, clean_log: dr.Log):
-    identified(clean_log, dr.models.planar_rotorcraft(gravity=9.80665))
+    dr.identify(dr.models.planar_rotorcraft(gravity=9.80665), clean_log, method="ols").save("model.json")
     unknown = run("fly", "model.json", "--trajectory", "square")
     done = run("fly", "model.json", "--trajectory", "square", *IMBALANCE)
     assert unknown.exit_code == 1
@@ -339,7 +340,8 @@ def test_what_cannot_be_done_ends_with_1_and_leaves_no_file(
 
 def test_a_plan_that_fails_writes_nothing_over_what_is_there(folder: Path, clean_log: dr.Log):
     heavy = {**clean_log.signals, "thrust": 3.0 * clean_log["thrust"]}
-    identified(dr.Log.from_arrays(clean_log.time, heavy))
+    log = dr.Log.from_arrays(clean_log.time, heavy)
+    dr.identify(dr.models.planar_rotorcraft(), log, method="ols").save("model.json")
     Path("flown.csv").write_text("mine")
     before = contents(folder)
     done = run(*FLY, "-o", "flown.csv", "--plot", "flight.png")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -39,8 +40,9 @@ def oscillator() -> dr.Model:
     )
 
 
+@cache
 def ringing(n: int = 3000, seed: int = 0, lacks: float = 0.0) -> dr.Log:
-    """A lightly damped Duffing oscillator at nine samples a period, inputs interpolated; by RK4 with 40 steps a sample.
+    """A lightly damped Duffing oscillator at nine samples a period, inputs interpolated; by RK4 with 10 steps a sample.
 
     ``lacks`` is a constant force that the model lacks, in V.
     """
@@ -48,7 +50,7 @@ def ringing(n: int = 3000, seed: int = 0, lacks: float = 0.0) -> dr.Log:
     t = np.arange(n) / RATE
     f = np.arange(1, 60)
     u = (0.05 * np.cos(2 * np.pi * 3.0 * f[:, None] * t + rng.uniform(0, 2 * np.pi, (len(f), 1)))).sum(axis=0) * 0.2
-    substeps = 40
+    substeps = 10
     h = 1.0 / RATE / substeps
 
     def slope(y: float, v: float, force: float) -> tuple[float, float]:

@@ -172,24 +172,27 @@ INERTIA = {"Jx": 0.02, "Jy": 0.05, "Jz": 0.04}
 @cache
 def tumble(seed, outliers=0.05):
     """Attitudes, rates and torques of a body through many turns: noise of 0.01 rad and 0.02 rad/s, outliers in both."""
-    rng, J = np.random.default_rng(seed), np.array(list(INERTIA.values()))
+    rng, J = np.random.default_rng(seed), list(INERTIA.values())
     torques = 0.15 * sum(
         np.sin(TURN * f * T[:, None] + rng.uniform(0.0, TURN, 3)) for f in rng.uniform(0.2, 1.5, (4, 1))
     )
 
     def rate(x, torque):
-        w = x[4:]
-        return np.concatenate([0.5 * product(x[:4], np.r_[0.0, w]), (torque - np.cross(w, J * w)) / J])
+        qw, qx, qy, qz, wx, wy, wz = x
+        turning = (-qx * wx - qy * wy - qz * wz, qw * wx + qy * wz - qz * wy)
+        turning += (qw * wy + qz * wx - qx * wz, qw * wz + qx * wy - qy * wx)
+        spinning = (torque[0] - (J[2] - J[1]) * wy * wz) / J[0], (torque[1] - (J[0] - J[2]) * wz * wx) / J[1]
+        return np.array([*(0.5 * x for x in turning), *spinning, (torque[2] - (J[1] - J[0]) * wx * wy) / J[2]])
 
     x, rows = np.array([1.0, 0.0, 0.0, 0.0, 2.0, -1.0, 0.5]), []
-    for torque in torques:
+    for torque in torques.tolist():
         rows.append(x)
         for _ in range(4):
             h = DT / 4
-            k1 = rate(x, torque)
-            k2 = rate(x + h / 2 * k1, torque)
-            k3 = rate(x + h / 2 * k2, torque)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, torque))
+            k1 = rate(x.tolist(), torque)
+            k2 = rate((x + h / 2 * k1).tolist(), torque)
+            k3 = rate((x + h / 2 * k2).tolist(), torque)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate((x + h * k3).tolist(), torque))
             x[:4] = normed(x[:4])
     rows = np.array(rows)
     turned = normed(np.column_stack([np.ones(N), 0.005 * rng.normal(size=(N, 3))]))

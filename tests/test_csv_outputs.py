@@ -2,6 +2,8 @@
 
 import csv
 import json
+from contextlib import chdir
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,22 @@ def made(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def path_of(made):
+    """Function that returns the file of a case, which is written once."""
+
+    @cache
+    def path(case):
+        *words, name = {**LOGS, **TABLES}[case]
+        file = made / f"{case.replace(' ', '-')}-{name}"
+        with chdir(made):
+            done = run(*words, file)
+        assert done.exit_code == 0, done.stderr
+        return file
+
+    return path
+
+
 def test_every_command_is_among_those_that_are_run():
     assert {words[0] for words in (*LOGS.values(), *TABLES.values())} | OTHERS == set(_MODULES)
 
@@ -60,12 +78,8 @@ def first_line(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("case", [*LOGS, *TABLES])
-def test_the_first_line_is_the_header_for_every_reader(made, monkeypatch, case):
-    monkeypatch.chdir(made)
-    words = {**LOGS, **TABLES}[case]
-    done = run(*words)
-    assert done.exit_code == 0, done.stderr
-    path = made / words[-1]
+def test_the_first_line_is_the_header_for_every_reader(path_of, case):
+    path = path_of(case)
     header = first_line(path)
     assert all(header)
     assert not header[0].startswith("#")
@@ -75,10 +89,8 @@ def test_the_first_line_is_the_header_for_every_reader(made, monkeypatch, case):
 
 
 @pytest.mark.parametrize("case", LOGS)
-def test_bits_units_and_history_of_a_log_read_back(made, monkeypatch, case):
-    monkeypatch.chdir(made)
-    run(*LOGS[case])
-    path = made / LOGS[case][-1]
+def test_bits_units_and_history_of_a_log_read_back(path_of, case, tmp_path):
+    path = path_of(case)
     log = dr.read_log(path)
     exact = pd.read_csv(path, dtype=str).map(float)
     fast = pl.read_csv(path, infer_schema_length=None)
@@ -86,7 +98,7 @@ def test_bits_units_and_history_of_a_log_read_back(made, monkeypatch, case):
         np.testing.assert_array_equal(log[name], exact[name])
         np.testing.assert_array_equal(log[name], fast[name].cast(pl.Float64).fill_null(np.nan).to_numpy())
     np.testing.assert_array_equal(log.time, exact["t"])
-    again = made / f"again{''.join(path.suffixes)}"
+    again = tmp_path / path.name
     log.write(again)
     second = dr.read_log(again)
     assert (second.units, second.history, second.notes, second.filter) == (

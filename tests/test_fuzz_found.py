@@ -5,6 +5,7 @@ import os
 import sqlite3
 import struct
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,12 @@ from rebuilt import built, log
 from studies import OWN, OWN_PLANT, TINY, row, tiny
 
 T = 0.05 * np.arange(40)
+
+
+@cache
+def stored() -> str:
+    """JSON of a result of lo-diransac."""
+    return json.dumps(dr.identify(built(), log()).to_dict())
 
 
 def written(path: Path, **columns: np.ndarray) -> Path:
@@ -173,7 +180,7 @@ def test_timing_of_other_than_the_inputs_is_refused_on_loading(name):
 
 @pytest.mark.parametrize(("name", "value"), [("delay", 1e308), ("lag", "nan"), ("own_delays", [1e308])])
 def test_timing_that_overflows_is_refused_on_loading(name, value):
-    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    data = json.loads(stored())
     data["resolution"]["timing"][name] = value
     with pytest.raises(dr.ResultError, match="timing: it is that of no machine"):
         dr.Result.from_dict(data)
@@ -181,7 +188,7 @@ def test_timing_that_overflows_is_refused_on_loading(name, value):
 
 @pytest.mark.parametrize("name", ["unmodelled_time", "smoothed_time", "smoothed_states", "unmodelled_accelerations"])
 def test_figures_of_other_than_the_windows_are_refused_on_loading(name):
-    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    data = json.loads(stored())
     found = data["diagnosis"][name]
     (found if isinstance(found, list) else next(iter(found.values()))).pop()
     with pytest.raises(dr.ResultError, match=r"figures of other than \d+ windows"):
@@ -190,7 +197,7 @@ def test_figures_of_other_than_the_windows_are_refused_on_loading(name):
 
 @pytest.mark.parametrize("value", [1e200, "nan", "-inf"])
 def test_figures_of_windows_that_overflow_are_refused_on_loading(value):
-    data = json.loads(json.dumps(dr.identify(built(), log()).to_dict()))
+    data = json.loads(stored())
     next(iter(data["diagnosis"]["unmodelled_accelerations"].values()))[3] = value
     with pytest.raises(dr.ResultError, match="figures of windows that no machine has"):
         dr.Result.from_dict(data)

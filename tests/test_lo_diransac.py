@@ -177,14 +177,6 @@ def test_a_log_that_cannot_give_a_parameter_at_all_is_refused():
         found("planar-rotorcraft", *climb(moment=0.0))
 
 
-def test_same_seed_same_answer():
-    signals, inputs = flown("planar-rotorcraft")
-    spoilt = with_outliers(signals, 0.3, 30.0, seed=8)
-    first, second = (found("planar-rotorcraft", spoilt, inputs, seed=3) for _ in range(2))
-    assert first.parameters == second.parameters
-    assert np.array_equal(first.covariance, second.covariance)
-
-
 def test_a_log_of_a_few_rows_is_refused():
     signals, inputs = flown("planar-rotorcraft")
     with pytest.raises(LogError, match="too few"):

@@ -99,7 +99,7 @@ def four_bar(folder: Path) -> tuple[Path, dr.Log]:
     names = {n: (lambda d, k=k: d.qpos[k], 5e-4) for n, k in joints.items()}
     names |= {f"{n}_dot": (lambda d, k=k: d.qvel[k], 0.02) for n, k in joints.items()}
     log = recorded(
-        FOUR_BAR.format(a=0.006, m=0.5), lambda t: 0.6 * np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t), 4.0, names, 1
+        FOUR_BAR.format(a=0.006, m=0.5), lambda t: 0.6 * np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t), 2.0, names, 1
     )
     return path, log
 
@@ -267,8 +267,8 @@ CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
 @pytest.mark.parametrize(("mass", "late"), [(30.0, 0), (0.5, -3)])
 def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: float, late: int) -> None:
     machine = mujoco.MjModel.from_xml_string(CART.format(m=1.0, d=2.0))
-    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(2000)
-    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((2000, 2))
+    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(1000)
+    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((1000, 2))
     for k, u in enumerate(force):
         motion[k] = data.qpos[0], data.qvel[0]
         data.ctrl[0] = u
@@ -281,14 +281,6 @@ def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: f
     assert dict(result.parameters) == pytest.approx({"body/cart.mass": 1.0, "joint/x.damping": 2.0}, rel=1e-3)
     assert result.estimate.resolution.timing.delay == pytest.approx(-0.002 * late, abs=5e-5)
     assert str(result.verdict) == ("usable with care" if late else "usable")
-
-
-def test_the_same_seed_gives_the_same_answer(
-    four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result]
-) -> None:
-    settings = dr.Settings(threads=1)
-    again = dr.identify(linkage[0], four_bar[1], settings=settings)
-    assert again.parameters == linkage[1].parameters
 
 
 @pytest.mark.parametrize(
@@ -345,7 +337,7 @@ def test_a_stored_model_that_names_files_is_refused(linkage: tuple[MujocoModel, 
         MujocoModel.from_dict(json.loads(json.dumps(data)))
 
 
-def test_the_command_line_does_the_same(
+def test_the_command_line_gives_the_same_numbers(
     four_bar: tuple[Path, dr.Log], linkage: tuple[MujocoModel, dr.Result], tmp_path: Path
 ) -> None:
     path, log = four_bar
@@ -353,8 +345,7 @@ def test_the_command_line_does_the_same(
     arguments = ["--model", str(path), "--simulator", "mujoco", "--unknown", "joint/crank.armature,body/coupler.mass"]
     done = run("identify", str(tmp_path / "log.csv"), *arguments, "-o", str(tmp_path / "a.json"), "--json")
     assert done.exit_code == 0, done.stderr
-    found = json.loads(done.stdout)["parameters"]
-    assert found["body/coupler.mass"] == pytest.approx(linkage[1].parameters["body/coupler.mass"], rel=1e-3)
+    assert json.loads(done.stdout)["parameters"] == linkage[1].parameters  # it is the same seed, too
     for more, said in ((["--simulator", "gazebo"], "there is mujoco"), (["--simulator", "mujoco"], "needs --unknown")):
         refused = run("identify", str(tmp_path / "log.csv"), "--model", str(path), *more)
         assert refused.exit_code == 2

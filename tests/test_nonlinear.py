@@ -145,14 +145,16 @@ def test_fits_do_not_depend_on_how_many_are_made_at_a_time():
     assert bound.select(sets[:4]).fit().tobytes() == one_by_one[:4].tobytes()
 
 
-@pytest.mark.parametrize("batch_size", [1, 3, 64])
-def test_search_gives_the_same_bits_for_every_batch_size(batch_size):
+def test_search_gives_the_same_bits_for_every_batch_size():
     log = swing(noise=0.05)
     settings = dr.Settings(sample_size=8, max_iterations=6, stop_inlier_fraction=None)
-    usual = dr.identify(hanging_mass(), log, "i-diransac", settings=settings)
-    other = dr.identify(hanging_mass(), log, "i-diransac", settings=replace(settings, batch_size=batch_size))
-    assert other.parameters == usual.parameters
-    assert (other.fit_error, other.n_hypotheses) == (usual.fit_error, usual.n_hypotheses)
+    sizes = (settings.batch_size, 1, 3, 64)
+    usual, *others = (
+        dr.identify(hanging_mass(), log, "i-diransac", settings=replace(settings, batch_size=n)) for n in sizes
+    )
+    for batch_size, other in zip(sizes[1:], others, strict=True):
+        assert other.parameters == usual.parameters, batch_size
+        assert (other.fit_error, other.n_hypotheses) == (usual.fit_error, usual.n_hypotheses), batch_size
 
 
 def test_leaving_rows_out_is_fitting_the_others():

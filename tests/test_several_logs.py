@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -38,29 +39,16 @@ def pieces(machine, signals, inputs, n, dt=DT):
     return [named_log(machine, y, u, f"part {i}", dt) for i, (y, u) in enumerate(parts)]
 
 
-def vehicle(**changes):
+def affine(q, v, a, u, p):
+    return [p.mass * a.x + p.linear_drag * v.x + p.quadratic_drag * ca.fabs(v.x) * v.x + p.bias - u.thrust]
+
+
+def vehicle(equations=affine):
     """The vehicle whose constant force is another one in every log."""
-    own = {"bias": dr.Parameter("N", per_log=True)} | changes
-    parameters = {
-        "mass": dr.Parameter("kg", positive=True),
-        "linear_drag": dr.Parameter("N s/m"),
-        "quadratic_drag": dr.Parameter("N s^2/m^2"),
-    }
-    return dr.Model(
-        "vehicle",
-        {"x": "m"},
-        {"thrust": "N"},
-        parameters | own,
-        lambda q, v, a, u, p: [
-            p.mass * a.x + p.linear_drag * v.x + p.quadratic_drag * abs_of(v.x) * v.x + p.bias - u.thrust
-        ],
-    )
-
-
-def abs_of(x):
-    import casadi as ca
-
-    return ca.fabs(x)
+    units = {"linear_drag": "N s/m", "quadratic_drag": "N s^2/m^2"}
+    drags = {name: dr.Parameter(unit) for name, unit in units.items()}
+    parameters = {"mass": dr.Parameter("kg", positive=True), **drags, "bias": dr.Parameter("N", per_log=True)}
+    return dr.Model("vehicle", {"x": "m"}, {"thrust": "N"}, parameters, equations)
 
 
 @cache
@@ -233,20 +221,7 @@ def test_bias_of_each_log_is_found_beside_shared_parameters(method):
 
 @pytest.mark.parametrize("method", ["nls", "i-diransac", "lo-diransac"])
 def test_bias_of_each_log_is_found_by_a_model_that_is_not_affine(method):
-    model = dr.Model(
-        "vehicle",
-        {"x": "m"},
-        {"thrust": "N"},
-        {
-            "mass": dr.Parameter("kg", positive=True),
-            "linear_drag": dr.Parameter("N s/m"),
-            "quadratic_drag": dr.Parameter("N s^2/m^2"),
-            "bias": dr.Parameter("N", per_log=True),
-        },
-        lambda q, v, a, u, p: [
-            a.x + (p.linear_drag * v.x + p.quadratic_drag * abs_of(v.x) * v.x + p.bias - u.thrust) / p.mass
-        ],
-    )
+    model = vehicle(lambda q, v, a, u, p: [a.x + (affine(q, v, a, u, p)[0] - p.mass * a.x) / p.mass])
     assert model.nonlinear_parameters
     settings = dr.Settings(sample_size=30, max_iterations=5) if method == "i-diransac" else None
     result = dr.identify(model, biased_logs(), method, settings=settings)

@@ -1,13 +1,14 @@
 """Structural intervals: mixtures over terms that a model may lack, against brute force, refits and planted terms."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import diransac as dr
-from command_line import run
+from command_line import run_both
 from diransac.identification.methods.lo_diransac import term_evidence
 from diransac.identification.methods.lo_diransac.term_evidence import (
     CandidateTests,
@@ -119,6 +120,7 @@ CART = dr.Model(
 )
 
 
+@cache
 def cart_log(seed, *, drag=0.0, mean=3.0, swing=1.0, noise=0.003, n=1500, dt=0.01):
     """A cart of 2 kg with damping .5 N s/m, driven around a force, and perhaps quadratic drag."""
     rng = np.random.default_rng([seed, 5])
@@ -276,10 +278,10 @@ def test_command_shows_both_intervals(tmp_path, monkeypatch):
         "    equations=lambda q, v, a, u, p: [p.mass * a.x + p.damping * v.x - u.force])\n"
     )
     cart_log(0, mean=0.0, swing=2.0).write("log.csv")
-    shown = run("identify", "log.csv", "--model", "cart.py", "--differentiate", "--seed", 0, "-o", "model.json").stdout
+    words = ("identify", "log.csv", "--model", "cart.py", "--differentiate", "--seed", 0)
+    shown, data = run_both(monkeypatch, *words)
     assert "if the model is complete" in shown
     assert "if it may lack a term" in shown
-    data = json.loads(run("identify", "log.csv", "--model", "cart.py", "--differentiate", "--seed", 0, "--json").stdout)
     assert set(data["structural_intervals_95"]) == set(data["intervals_95"]) == set(TRUTH)
 
 

@@ -372,7 +372,9 @@ def test_missing_dry_friction_is_suggested_with_its_size(result):
     assert "sign(q_dot) explains" in found.text
 
 
-def test_the_suggested_term_lies_over_the_unmodelled_force(with_dry_friction, result, tmp_path):
+def test_the_suggested_term_lies_over_the_unmodelled_force_and_the_report_shows_it_and_the_line_to_add(
+    with_dry_friction, result, tmp_path
+):
     found = result.diagnosis
     force, term = found.unmodelled_forces["q_ddot"], found.suggested_terms["q_ddot"]
     # The answer is a mean of estimates that the friction biases; the suggestion alone explains more.
@@ -384,6 +386,8 @@ def test_the_suggested_term_lies_over_the_unmodelled_force(with_dry_friction, re
     page = (tmp_path / "page.html").read_text()
     assert "Dashed: what the suggested terms explain of it." in page
     assert 'class="trace line suggested"' in page
+    assert "The model seems to lack a term. Dry friction of q" in page
+    assert "add to the equation of q: + p.coulomb_q" in page
 
 
 def test_suggestions_are_printed_and_survive_json(result):
@@ -550,13 +554,6 @@ def test_methods_without_suggestions_refuse_a_refit(with_dry_friction):
 def test_candidate_terms_must_be_a_function():
     with pytest.raises(dr.SettingsError, match="candidate_terms is 3"):
         dr.LoDiransac(candidate_terms=3)
-
-
-def test_the_report_shows_the_term_and_the_line_to_add(result, with_dry_friction, tmp_path):
-    dr.write_report(result, with_dry_friction, tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text()
-    assert "The model seems to lack a term. Dry friction of q" in page
-    assert "add to the equation of q: + p.coulomb_q" in page
 
 
 PENDULUM_FILE = """
