@@ -173,9 +173,10 @@ def gusty_joint(seed):
     return model, dr.Log.from_arrays(t, {"angle": angle + 0.001 * rng.normal(size=len(t)), "command": command})
 
 
-def test_gusts_are_no_torques_that_nothing_measures():
+@pytest.mark.parametrize("seed", [1, 2])
+def test_gusts_are_no_torques_that_nothing_measures(seed):
     """Such torques would explain them with an inertia that is too small by as much as one likes."""
-    model, log = gusty_joint(1)
+    model, log = gusty_joint(seed)
     *_, now = dr.track(model, log, start={"inertia": 0.0065, "lag": 0.045})
     assert now.standard_errors["inertia"] < 3e-4
     assert now.parameters["inertia"] == pytest.approx(0.006, abs=2.0 * now.standard_errors["inertia"])
