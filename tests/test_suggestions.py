@@ -139,6 +139,11 @@ def test_forces_without_a_term_have_at_most_two_suggestions_in_fifty_logs(rho):
     assert found <= 2
 
 
+@pytest.mark.parametrize("n_terms", [0, 1])
+def test_without_candidates_nothing_is_suggested(n_terms):
+    assert not select(made_of(np.random.default_rng(0), n_terms=n_terms))
+
+
 def test_a_term_that_own_columns_span_is_not_suggested():
     rng = np.random.default_rng(0)
     made = made_of(rng)

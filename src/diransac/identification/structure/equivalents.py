@@ -29,9 +29,9 @@ from diransac.model import Model
 
 # Motions about which transfer functions are equal; frequencies, over the fastest and beyond the slowest eigenvalue.
 _N_MOTIONS, _N_FREQUENCIES, _BEYOND = 3, 8, 3.0
-# Starts, fewer of models with many parameters; their spread, the logarithm of a factor; steps; slope over the largest
-# of a parameter that a response shows.
-_N_STARTS, _N_SOLUTIONS, _SPREAD, _N_STEPS, _SHOWN = 48, 600, 1.5, 40, 1e-6
+# Starts, fewer of large models: elements of their matrices together; spread of the starts, the logarithm of a factor;
+# steps; slope over the largest of a parameter that a response shows.
+_STARTS, _ELEMENTS, _SPREAD, _N_STEPS, _SHOWN = (8, 48), 6000, 1.5, 40, 1e-6
 # Relative errors of transfer functions, and of signals, up to which both are equal; relative change of a parameter.
 _EQUAL, _SAME, _OTHER = 1e-7, 1e-6, 0.02
 _SEED, _ROUNDING = 20240607, 1e-12
@@ -66,7 +66,8 @@ def equivalent_parameters(
     half = half if ranges else 0.1 * half
     found = [parameters]
     with np.errstate(all="ignore"):
-        for start in _with_same_response(_response(model, parameters, measured, middle, half, rng), parameters, rng):
+        response = _response(model, parameters, measured, middle, half, rng)
+        for start in _with_same_response(response, parameters, len(model.state), rng):
             other = _with_same_signals(model, parameters, start, measured, middle, half)
             if other is not None and not any(is_close(other, x).all() for x in found):
                 found.append(other)
@@ -162,14 +163,16 @@ class _SameResponse:
         return cost, np.einsum("sij,si->sj", J, left), np.einsum("sij,sik->sjk", J, J)
 
 
-def _with_same_response(response: Response, parameters: FloatArray, rng: np.random.Generator) -> list[FloatArray]:
+def _with_same_response(
+    response: Response, parameters: FloatArray, n_x: int, rng: np.random.Generator
+) -> list[FloatArray]:
     """Parameters with the same response, in which something differs, each once."""
     known = np.flatnonzero(parameters)
     _, slopes = _SameResponse(response, parameters, known).slopes(np.zeros((1, len(known))))
     size = np.abs(slopes[0]).max(axis=0, initial=0.0)
     problem = _SameResponse(response, parameters, known[size > _SHOWN * size.max(initial=0.0)])
     n = len(problem.free)
-    starts = _SPREAD * rng.standard_normal((int(np.clip(_N_SOLUTIONS // (n + 1), 4, _N_STARTS)), n))
+    starts = _SPREAD * rng.standard_normal((int(np.clip(_ELEMENTS // ((n + 1) * n_x**2), *_STARTS)), n))
     z, cost = least_squares(problem, starts, _N_STEPS)
     found = [parameters]
     for one in problem.at(z[cost < np.square(_EQUAL) * slopes.shape[1]]):

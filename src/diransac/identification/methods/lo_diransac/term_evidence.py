@@ -253,9 +253,8 @@ class CandidateTests:
     def _pairs(self) -> tuple[IntArray, FloatArray]:
         """Pairs ``(P, 2)`` of different effects that the log determines, and their log odds if residuals are white."""
         odds, prior = self._prior
-        columns = self.regression.columns.reshape(-1, len(self.terms))
-        gram: FloatArray = columns.T @ columns
-        values: FloatArray = -columns.T @ self.regression.residuals.ravel()
+        columns, over = self.regression.columns, ([0, 1], [0, 1])
+        gram, values = (np.tensordot(columns, x, over) for x in (columns, -self.regression.residuals))
         a, b = np.triu_indices(len(self.terms), 1)
         effects = np.unique([x.parameter for x in self.terms], return_inverse=True)[1]
         own, separate = np.diag(gram), gram[a, a] - np.square(gram[a, b]) / (gram[b, b] + _TINY)
