@@ -61,11 +61,6 @@ def test_poles_of_a_motor_have_another_inductance_and_inertia():
     assert other == pytest.approx([J / b, L * b, b], rel=1e-6)
 
 
-def test_other_solutions_beyond_bounds_are_none():
-    model = two_lags(actuator={"upper": 0.2})
-    assert not equivalent_parameters(model, np.array([0.08, 0.4, 1.5]), ["y"])
-
-
 @pytest.mark.parametrize(
     ("model", "parameters", "measured"),
     [
@@ -97,10 +92,10 @@ def test_a_result_that_another_one_equals_is_not_to_be_relied_on():
     found = dr.identify(two_lags(), log, differentiate=True)
     lags = sorted(found.parameters[n] for n in ("actuator", "plant"))
     assert lags == pytest.approx([0.08, 0.4], rel=0.02)
-    (said,) = [x for x in found.findings if "is the same with" in x]
+    (said,) = [x for x in found.findings if "explain this log as well" in x]
     assert said.level == "bad"
     assert found.verdict == "do not rely on this"
     bounded = dr.identify(two_lags(plant={"upper": 0.2}), log, differentiate=True)
-    assert not [x for x in bounded.findings if "is the same with" in x]
+    assert not [x for x in bounded.findings if "explain this log as well" in x]
     assert bounded.parameters["actuator"] == pytest.approx(0.4, rel=0.02)
     assert bounded.parameters["plant"] == pytest.approx(0.08, rel=0.02)

@@ -548,7 +548,7 @@ def test_an_accelerometer_alone_shows_two_lags():
     lags = sorted(found.parameters[n] for n in ("tau", "sensor_tau"))  # they may be exchanged
     assert [*(found.parameters[n] for n in ("linear", "square")), *lags] == pytest.approx([*WEIGHED.values()], rel=0.15)
     (said,) = [x for x in found.findings if x.level == "bad"]
-    assert "is the same with tau = " in said
+    assert "explain this log as well" in said
     assert "sensor_tau = " in said
     others = [x for x in found.findings if x.level == "care"]
     assert all("If the model lacks a term" in x for x in others)  # commands vary by a tenth of their mean

@@ -1,12 +1,12 @@
-"""Other parameters with which the measured signals would be the same, as two time constants that change places.
+"""Other parameters with the same transfer function at rest, as two time constants that change places.
 
 Where states are not measured, signals may determine the parameters up to a few solutions.  `structural` finds those
-that form a continuum, this module isolated ones.  About a motion, signals follow inputs by the transfer function
+that form a continuum, this module isolated ones.  About rest, signals follow inputs by the transfer function
 
     G(s) = C (s I - A)^-1 B + D
 
-of the linearised model.  Parameters with the same G about several random motions are sought from random starts, by the
-method of Levenberg and Marquardt.  Those that also give the same signals of a random motion of the model are returned.
+of the linearised model.  Parameters with the same G are sought from random starts, by the method of Levenberg and
+Marquardt.  Those of a linear model explain every log as well; those of others may be another optimum of a fit.
 
 References
 ----------
@@ -24,16 +24,16 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.structure.structural import Ranges, centres, outputs, random_motion
+from diransac.identification.structure.structural import Ranges
 from diransac.model import Model
 
-# Motions about which transfer functions are equal; frequencies, over the fastest and beyond the slowest eigenvalue.
-_N_MOTIONS, _N_FREQUENCIES, _BEYOND = 3, 8, 3.0
+# Number of frequencies, over the fastest and beyond the slowest eigenvalue.
+_N_FREQUENCIES, _BEYOND = 8, 3.0
 # Starts, fewer of large models: elements of their matrices together; spread of the starts, the logarithm of a factor;
 # steps; slope over the largest of a parameter that a response shows.
 _STARTS, _ELEMENTS, _SPREAD, _N_STEPS, _SHOWN = (8, 48), 6000, 1.5, 40, 1e-6
-# Relative errors of transfer functions, and of signals, up to which both are equal; relative change of a parameter.
-_EQUAL, _SAME, _OTHER = 1e-7, 1e-6, 0.02
+# Relative error of a transfer function up to which it is equal; relative change of a parameter that is another one.
+_EQUAL, _OTHER = 1e-7, 0.02
 _SEED, _ROUNDING = 20240607, 1e-12
 Response = Callable[[FloatArray], FloatArray]
 
@@ -41,37 +41,42 @@ Response = Callable[[FloatArray], FloatArray]
 def equivalent_parameters(
     model: Model, parameters: FloatArray, measured: Sequence[str], ranges: Ranges | None = None
 ) -> list[FloatArray]:
-    """Parameters within their bounds that give the same measured signals as an estimate, whatever the inputs.
+    """Parameters with which measured signals follow the inputs about rest as with given ones.
 
     Parameters
     ----------
     model : Model
         Whose parameters `structural` finds identifiable from these signals.
     parameters : (n_p,) array
-        The estimate, each in its unit.
+        Each in its unit.
     measured : sequence of str
         Signals that are measured.
     ranges : tuple of (str, float, float), optional
-        Of states and inputs, in which a log's motion is.
+        Of states and inputs, in which a log's motion is; rest is in the middle of those that do not contain zero.
 
     Returns
     -------
     list of (n_p,) array
-        Without the estimate.
+        Without the given ones; each differs from the others by more than 2 % in a parameter.
     """
     if not model.n_u:
         return []
-    rng, bounds = np.random.default_rng(_SEED), list(model.parameters.values())
-    middle, half = centres(model, ranges or ())
-    half = half if ranges else 0.1 * half
-    found = [parameters]
     with np.errstate(all="ignore"):
-        response = _response(model, parameters, measured, middle, half, rng)
-        for start in _with_same_response(response, parameters, len(model.state), rng):
-            other = _with_same_signals(model, parameters, start, measured, middle, half)
-            if other is not None and not any(is_close(other, x).all() for x in found):
-                found.append(other)
-    return [x for x in found[1:] if all(b.lower <= y <= b.upper for b, y in zip(bounds, x, strict=True))]
+        response = _response(model, parameters, measured, ranges or ())
+        known = np.flatnonzero(parameters)
+        _, slopes = _SameResponse(response, parameters, known).slopes(np.zeros((1, len(known))))
+        size = np.nan_to_num(np.abs(slopes[0])).max(axis=0, initial=0.0)
+        problem = _SameResponse(response, parameters, known[size > _SHOWN * size.max(initial=0.0)])
+        if not len(problem.free):
+            return []
+        n, rng = len(problem.free), np.random.default_rng(_SEED)
+        n_starts = int(np.clip(_ELEMENTS // ((n + 1) * len(model.state) ** 2), *_STARTS))
+        z, cost = least_squares(problem, _SPREAD * rng.standard_normal((n_starts, n)), _N_STEPS)
+    found = [parameters]
+    for one in problem.at(z[cost < np.square(_EQUAL) * slopes.shape[1]]):
+        if not any(is_close(one, x).all() for x in found):
+            found.append(one)
+    return found[1:]
 
 
 def is_close(a: FloatArray, b: FloatArray) -> BoolArray:
@@ -90,42 +95,41 @@ def _linear(model: Model) -> ca.Function:
     return ca.Function("linear", [x, u, p], slopes)
 
 
-def _response(
-    model: Model,
-    parameters: FloatArray,
-    measured: Sequence[str],
-    middle: FloatArray,
-    half: FloatArray,
-    rng: np.random.Generator,
-) -> Response:
-    """Function ``(S, n_p) -> (S, M)``: real and imaginary parts of transfer functions, over the estimate's largest."""
-    n_x, rows = len(model.state), [model.signals.index(n) for n in measured]
-    points = middle[:, None] + half[:, None] * rng.uniform(-1.0, 1.0, (len(middle), _N_MOTIONS))
+def _rest(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
+    """States and inputs, zero where their range contains it or none is known, else in its middle."""
+    middle = {name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high) for name, low, high in ranges}
+    x, u = (np.array([middle.get(n, 0.0) for n in names]) for names in (model.state, model.inputs))
+    for four in model.quaternions:
+        x[list(four)] = [1.0, 0.0, 0.0, 0.0]
+    return x, u
+
+
+def _response(model: Model, parameters: FloatArray, measured: Sequence[str], ranges: Ranges) -> Response:
+    """Function ``(S, n_p) -> (S, M)``: real and imaginary parts of the transfer functions, over the given ones'."""
+    rows, (rest, input_) = [model.signals.index(n) for n in measured], _rest(model, ranges)
 
     def slopes(p: FloatArray) -> list[FloatArray]:
-        """A, B, C, D: (S n, ., .) each."""
-        x = np.tile(points, len(p))
-        matrices = _linear(model)(x[:n_x], x[n_x:], np.repeat(p, _N_MOTIONS, axis=0).T)
-        parts = [np.array(y) for y in matrices]
-        return [np.moveaxis(y.reshape(len(y), x.shape[1], -1), 0, 1) for y in parts]
+        """A, B, C, D: (S, ., .) each."""
+        x, u = (np.repeat(y[:, None], len(p), axis=1) for y in (rest, input_))
+        parts = [np.array(y) for y in _linear(model)(x, u, p.T)]
+        return [np.moveaxis(y.reshape(len(y), len(p), -1), 0, 1) for y in parts]
 
     A, *_ = slopes(parameters[None])
-    rates = np.abs(np.linalg.eigvals(np.where(np.isfinite(A), A, 0.0))).ravel()
+    rates = np.abs(np.linalg.eigvals(np.nan_to_num(A))).ravel()
     rates = rates[rates > _ROUNDING * rates.max(initial=0.0)]
     slowest, fastest = (rates.min(), rates.max()) if len(rates) else (1.0, 1.0)
     s = 1j * np.geomspace(slowest / _BEYOND, fastest * _BEYOND, _N_FREQUENCIES)[:, None, None, None]
 
     def transfer(p: FloatArray) -> FloatArray:
         A, B, C, D = slopes(p)
-        G = C[:, rows] @ np.linalg.solve(s * np.eye(n_x) - A, B.astype(complex)) + D[:, rows]
+        G = C[:, rows] @ np.linalg.solve(s * np.eye(len(rest)) - A, B.astype(complex)) + D[:, rows]
         return np.stack([G.real, G.imag])
 
-    size = np.abs(transfer(parameters[None])).max(axis=(0, 1), keepdims=True)
+    size = np.abs(transfer(parameters[None])).max(axis=(0, 1))
     size[size == 0.0] = np.inf
 
     def response(p: FloatArray) -> FloatArray:
-        values = transfer(p).reshape(2, _N_FREQUENCIES, len(p), *size.shape[2:]) / size
-        return np.asarray(np.moveaxis(values, 2, 0).reshape(len(p), -1))
+        return np.asarray(np.moveaxis(transfer(p) / size, 2, 0).reshape(len(p), -1))
 
     return response
 
@@ -161,47 +165,3 @@ class _SameResponse:
         cost = np.square(left).sum(axis=1)
         cost[~(np.isfinite(cost) & np.isfinite(J).all(axis=(1, 2)))] = np.inf
         return cost, np.einsum("sij,si->sj", J, left), np.einsum("sij,sik->sjk", J, J)
-
-
-def _with_same_response(
-    response: Response, parameters: FloatArray, n_x: int, rng: np.random.Generator
-) -> list[FloatArray]:
-    """Parameters with the same response, in which something differs, each once."""
-    known = np.flatnonzero(parameters)
-    _, slopes = _SameResponse(response, parameters, known).slopes(np.zeros((1, len(known))))
-    size = np.abs(slopes[0]).max(axis=0, initial=0.0)
-    problem = _SameResponse(response, parameters, known[size > _SHOWN * size.max(initial=0.0)])
-    n = len(problem.free)
-    starts = _SPREAD * rng.standard_normal((int(np.clip(_ELEMENTS // ((n + 1) * n_x**2), *_STARTS)), n))
-    z, cost = least_squares(problem, starts, _N_STEPS)
-    found = [parameters]
-    for one in problem.at(z[cost < np.square(_EQUAL) * slopes.shape[1]]):
-        if not any(is_close(one, x).all() for x in found):
-            found.append(one)
-    return found[1:]
-
-
-def _with_same_signals(
-    model: Model,
-    parameters: FloatArray,
-    start: FloatArray,
-    measured: Sequence[str],
-    middle: FloatArray,
-    half: FloatArray,
-) -> FloatArray | None:
-    """Parameters near a start that give the signals of a random motion, from some initial state; None if none do."""
-    x, inputs = random_motion(model, middle, half, np.random.default_rng(_SEED))
-    step = 0.2 / max(1.0, float(np.linalg.norm(np.array(model.rate_jacobians(x, inputs[0], parameters)[0]))))
-    target = outputs(model, x.copy(), inputs, parameters, measured, step)[0]
-    p, x = start.copy(), x.copy()
-    for _ in range(12):
-        y, J_x, J_p = outputs(model, x.copy(), inputs, p, measured, step)
-        if not (np.isfinite(y).all() and np.isfinite(J_x).all() and np.isfinite(J_p).all()):
-            return None
-        if np.abs(y - target).max() < _SAME * np.abs(target).max():
-            return p
-        J = np.hstack([J_x, J_p])
-        size = np.linalg.norm(J, axis=0) + 1e-300
-        change = np.linalg.lstsq(J / size, target - y, rcond=1e-12)[0] / size
-        x, p = x + change[: len(x)], p + change[len(x) :]
-    return None

@@ -171,8 +171,8 @@ def _random_parameters(bounds: Sequence[Parameter], rng: np.random.Generator) ->
     return np.where(has_lower & has_upper, low + draw / 3.0 * (high - low), open_ended)
 
 
-def centres(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
-    """Middle and half width ``(n_x + n_u,)`` of the range of each state and input; 0 and 10 without one."""
+def _centres(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
+    """Middle and half width ``(n_x + n_u,)`` of the range of each state and input."""
     found = {name: (0.5 * (low + high), 0.5 * (high - low)) for name, low, high in ranges}
     pairs = [found.get(name, (0.0, 0.0)) for name in (*model.state, *model.inputs)]
     middle, half = np.array(pairs).reshape(-1, 2).T
@@ -182,7 +182,7 @@ def centres(model: Model, ranges: Ranges) -> tuple[FloatArray, FloatArray]:
 def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, ranges: Ranges) -> FloatArray:
     """Rows ``(n, n_p)`` of ``dr/dp`` and ``dy/dp`` at random motions that satisfy the equations, each of unit size."""
     n = max(60, 4 * model.n_p)
-    middle, half = (x[:, None] for x in centres(model, ranges))
+    middle, half = (x[:, None] for x in _centres(model, ranges))
     sizes = (model.n_q, model.n_v, model.n_u)
     drawn = middle + half * np.concatenate([_random_numbers((size, n), rng) for size in sizes])
     q, v, u = np.split(drawn, np.cumsum(sizes)[:2])
@@ -205,11 +205,27 @@ def _output_jacobian(
     Four motions are sequences of Euler's steps, which have the symmetries of the equations: two per unknown, each a
     fifth of the fastest time constant.
     """
-    middle, half = centres(model, ranges)
-    half, blocks = half / (1.0 if ranges else _HALF_RANGE), []
+    n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
+    middle, half = _centres(model, ranges)
+    half = half / (1.0 if ranges else _HALF_RANGE)
+    rows, blocks = [model.signals.index(n) for n in measured], []
     for _ in range(4):
-        x, u = random_motion(model, middle, half, rng)
-        _, J_x, J_p = outputs(model, x, u, p, measured)
+        x, step = middle[:n_x] + half[:n_x] * rng.normal(size=n_x), 0.0
+        of_x, of_p, seen_x, seen_p = np.eye(n_x), np.zeros((n_x, model.n_p)), list[FloatArray](), list[FloatArray]()
+        for _ in range(2 * (n_x + model.n_p)):
+            for four in model.quaternions:
+                x[list(four)] /= np.linalg.norm(x[list(four)])
+            u = middle[n_x:] + half[n_x:] * rng.normal(size=model.n_u)
+            A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
+            step = step or 0.2 / max(1.0, float(np.linalg.norm(A)))
+            moved_x, moved_p = A @ of_x, A @ of_p + P
+            x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
+            C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
+            seen_x.append(np.vstack([of_x, moved_x[n_q:], C @ of_x + D @ moved_x[n_q:]])[rows])
+            seen_p.append(np.vstack([of_p, moved_p[n_q:], C @ of_p + D @ moved_p[n_q:] + S])[rows])
+            x = x + step * x_dot
+            of_x, of_p = of_x + step * moved_x, of_p + step * moved_p
+        J_x, J_p = np.concatenate(seen_x), np.concatenate(seen_p)
         if np.isfinite(J_x).all() and np.isfinite(J_p).all():
             U, sizes, _ = np.linalg.svd(J_x, full_matrices=False)
             U = U[:, sizes > _RANK_OF_OUTPUTS * sizes[0]]
@@ -217,63 +233,12 @@ def _output_jacobian(
     return np.concatenate(blocks) if blocks else np.zeros((0, model.n_p))
 
 
-def random_motion(
-    model: Model, middle: FloatArray, half: FloatArray, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """A random initial state ``(n_x,)``, and two random inputs ``(2 n, n_u)`` per unknown."""
-    n_x = len(model.state)
-    x = middle[:n_x] + half[:n_x] * rng.normal(size=n_x)
-    return x, middle[n_x:] + half[n_x:] * rng.normal(size=(2 * (n_x + model.n_p), model.n_u))
-
-
-def outputs(
-    model: Model, x: FloatArray, inputs: FloatArray, p: FloatArray, measured: Sequence[str], step: float = 0.0
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Measured signals of a sequence of Euler's steps, which has the symmetries of the equations.
-
-    Parameters
-    ----------
-    model : Model
-    x : (n_x,) array
-        Initial state.
-    inputs : (n, n_u) array
-    p : (n_p,) array
-    measured : sequence of str
-    step : float, optional
-        s; by default a fifth of the fastest time constant.
-
-    Returns
-    -------
-    (m,) array, (m, n_x) array, (m, n_p) array
-        Their derivatives with respect to the initial state, and to the parameters.
-    """
-    n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
-    rows = [model.signals.index(n) for n in measured]
-    of_x, of_p, seen = np.eye(n_x), np.zeros((n_x, model.n_p)), list[tuple[FloatArray, FloatArray, FloatArray]]()
-    for u in inputs:
-        for four in model.quaternions:
-            x[list(four)] /= np.linalg.norm(x[list(four)])
-        A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
-        step = step or 0.2 / max(1.0, float(np.linalg.norm(A)))
-        moved_x, moved_p = A @ of_x, A @ of_p + P
-        x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
-        y, C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
-        signals = np.concatenate([x, x_dot[n_q:], y.ravel()])
-        seen_x = np.vstack([of_x, moved_x[n_q:], C @ of_x + D @ moved_x[n_q:]])
-        seen_p = np.vstack([of_p, moved_p[n_q:], C @ of_p + D @ moved_p[n_q:] + S])
-        seen.append((signals[rows], seen_x[rows], seen_p[rows]))
-        x = x + step * x_dot
-        of_x, of_p = of_x + step * moved_x, of_p + step * moved_p
-    y, J_x, J_p = (np.concatenate(z) for z in zip(*seen, strict=True))
-    return y, J_x, J_p
-
-
 def _sensor_slopes(model: Model) -> ca.Function:
-    """Function ``(x, a, u, p) -> y, dy/d(x, a, p)`` of the sensors: a vector, and three matrices."""
+    """Function ``(x, a, u, p) -> dy/d(x, a, p)`` of the sensors, three matrices."""
     sizes = {"x": len(model.state), "a": model.n_v, "u": model.n_u, "p": model.n_p}
     x, a, u, p = (ca.SX.sym(name, n) for name, n in sizes.items())
     y = model.readings(x, a, u, p)
-    return ca.Function("sensor_slopes", [x, a, u, p], [y, *(ca.jacobian(y, z) for z in (x, a, p))])
+    return ca.Function("sensor_slopes", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
 
 
 def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:

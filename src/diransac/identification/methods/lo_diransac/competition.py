@@ -27,7 +27,13 @@ from diransac.identification.methods.lo_diransac.projection import (
     projected_candidates,
     with_parameters,
 )
-from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
+from diransac.identification.methods.lo_diransac.search import (
+    Decided,
+    Searched,
+    likeliest,
+    searched,
+    with_equivalents,
+)
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import estimates_of_logs, simulation_error_candidates
 from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -94,7 +100,7 @@ def compete(
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
     Where no search from samples succeeds, or its fit is challenged, another one begins with the best of the other
-    estimates, and the likelier of the two counts.
+    estimates, and where other parameters have the same transfer function, with these; the likeliest counts.
 
     Parameters
     ----------
@@ -121,8 +127,10 @@ def compete(
         first = likeliest(settings, dataset, seed, callback, whole)
     except (IdentificationError, np.linalg.LinAlgError) as error:
         first, refused = None, error
-    if first is not None and (is_settled(first.likeliest, first.motion) or not first.likeliest.complete):
+    if first is not None and not first.likeliest.complete:
         return first
+    if first is not None and is_settled(first.likeliest, first.motion):
+        return with_equivalents(settings, dataset, first, seed, callback)
     intervals, motion = whole[:2]
     if first is not None:
         intervals, motion = replace(intervals, substeps=first.likeliest.intervals.substeps), first.motion
@@ -245,11 +253,16 @@ class Contest:
         if best is not None and (first is None or self.is_challenged(first, judged, best)):
             other = self._searched_from(best, notes)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
-                if is_settled(other.likeliest, other.motion):
-                    return other
-                self.add_fit(other)
-                found, judged = other, self._judged(other)
-        return found if found is None or judged is None else self._decided(found, judged)
+                found = other
+        if found is None:
+            return None
+        found = with_equivalents(self.settings, self.dataset, found, self.seed, self.callback)
+        if first is None or found.likeliest is not first.likeliest:
+            if is_settled(found.likeliest, found.motion):
+                return found
+            self.add_fit(found)
+            judged = self._judged(found)
+        return found if judged is None else self._decided(found, judged)
 
     def is_challenged(self, search: Searched, judged: _Judgement, rival: int) -> bool:
         """True if a fit is exact although its noise is not white, or if a rival beats or contradicts its estimates.

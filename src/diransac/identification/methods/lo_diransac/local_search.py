@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 
 LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 """Errors by which inputs act late."""
+AS_LIKELY = 5.0
+"""Difference of two fits' evidence, nats, below which both are as likely."""
 
-# Difference of two fits' evidence, nats, below which both are as likely.
-_AS_LIKELY = 5.0
 # Shortest interval, samples.
 _SHORTEST = 3
 # Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
@@ -227,7 +227,7 @@ class LocalSearch:
         sought, timings = self._sought(best), [best.intervals.all_inputs(what) for what in LATE]
         # A lag shows as a delay, and is tried where one does.
         tested = [x for x in sought if x.what != "lag" or replace(x, what="delay") not in sought]
-        errors = clear_errors(best.intervals, best.refinement.fit, tested, worth=_AS_LIKELY)
+        errors = clear_errors(best.intervals, best.refinement.fit, tested, worth=AS_LIKELY)
         common = max((x for x in errors if x.kind in timings), key=lambda x: x.gain, default=None)
         others = [self._moved(best, x) for x in self._timings(best, common, sought, free_hold=free_hold)]
         # Which hold is the likelier shows once its errors are at their optimum.
@@ -293,7 +293,7 @@ class LocalSearch:
             lower = now.unexplained - x.unexplained
             return bool((lower.max() if of_one else lower.sum()) > least)
 
-        others = [x for x in others if x.cost < now.cost - _AS_LIKELY and (x.exact or explains(x))]
+        others = [x for x in others if x.cost < now.cost - AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
     def _from_hypothesis(self, intervals: ShootingIntervals) -> Explanation:
@@ -324,7 +324,7 @@ class LocalSearch:
             return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
             finer = self._split(flexible, parts)
-            if finer.cost > flexible.cost - _AS_LIKELY:
+            if finer.cost > flexible.cost - AS_LIKELY:
                 break
             flexible = finer
         return flexible

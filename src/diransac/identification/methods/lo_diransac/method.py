@@ -39,9 +39,9 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.regression.rows import excited
-from diransac.identification.structure.equivalents import equivalent_parameters, is_close
+from diransac.identification.structure.equivalents import is_close
 from diransac.identification.structure.refusal import check_signs
-from diransac.identification.structure.structural import check_structure, structural, unidentifiable
+from diransac.identification.structure.structural import check_structure, unidentifiable
 from diransac.process import memory_kept
 
 if TYPE_CHECKING:
@@ -261,8 +261,7 @@ def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
 
 def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding]:
     """Findings where nothing measures a state, so that a search is doubtful, or other parameters are as good."""
-    intervals, model, layout = found.likeliest.intervals, dataset.model, dataset.layout
-    names = unmeasured_by_name(intervals)
+    layout, names = dataset.layout, unmeasured_by_name(found.likeliest.intervals)
     if found.is_doubtful:
         share = 100.0 * found.unexplained
         yield Finding(
@@ -271,17 +270,13 @@ def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding
             "does not tell them apart",
             f"measure {names}",
         )
-    signals = measured_signals(intervals)
-    if not names or layout.priors or structural(model, signals, dataset.ranges):
-        return
-    estimate = layout.of_log(found.result.parameters, 0)
-    for other in equivalent_parameters(model, estimate, signals, dataset.ranges)[:1]:
-        pairs = zip(model.parameters, other.tolist(), is_close(other, estimate), strict=True)
+    for other in found.as_likely[:1]:
+        pairs = zip(layout.names, other.tolist(), is_close(other, found.result.parameters), strict=True)
         changed = {n: x for n, x, close in pairs if not close}
         values = ", ".join(f"{n} = {x:.4g}" for n, x in changed.items())
         yield Finding(
             "bad",
-            f"Every log of these signals is the same with {values}, since nothing measures {names}",
+            f"Since nothing measures {names}, {values} explain this log as well",
             f"bound {' or '.join(changed)}, or measure {names}",
         )
 
