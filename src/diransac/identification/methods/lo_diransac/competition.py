@@ -130,7 +130,9 @@ def compete(
     if first is not None and not first.likeliest.complete:
         return first
     if first is not None and is_settled(first.likeliest, first.motion):
-        return with_equivalents(settings, dataset, first, seed, callback)
+        first = with_equivalents(settings, dataset, first, seed, callback)
+        if is_settled(first.likeliest, first.motion):
+            return first
     intervals, motion = whole[:2]
     if first is not None:
         intervals, motion = replace(intervals, substeps=first.likeliest.intervals.substeps), first.motion

@@ -209,11 +209,14 @@ def with_equivalents(
     if not unmeasured_states(intervals) or not layout.is_shared or structural(model, signals, dataset.ranges):
         return found
     every = [found]
-    for p in equivalent_parameters(model, found.result.parameters, signals, dataset.ranges):
-        if layout.admits(p[None])[0]:
-            begin, further = with_simulated_states(intervals, found.motion, p), within(callback, 0.895, 0.9)
-            with suppress(IdentificationError, np.linalg.LinAlgError):
-                every.append(searched(settings, intervals, begin, found.notes, seed, dataset, further, p[None]))
+    try:
+        for p in equivalent_parameters(model, found.result.parameters, signals, dataset.ranges):
+            if layout.admits(p[None])[0]:
+                begin, further = with_simulated_states(intervals, found.motion, p), within(callback, 0.895, 0.9)
+                with suppress(IdentificationError, np.linalg.LinAlgError):
+                    every.append(searched(settings, intervals, begin, found.notes, seed, dataset, further, p[None]))
+    except TimeLimitError:
+        return replace(found, likeliest=replace(found.likeliest, complete=False))
     best = min(every, key=lambda x: x.likeliest.cost)
     own = best.result.parameters
     others = [x.result.parameters for x in every if x.likeliest.cost < best.likeliest.cost + AS_LIKELY]
