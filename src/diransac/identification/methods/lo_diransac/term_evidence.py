@@ -271,17 +271,17 @@ class CandidateTests:
         chosen, allowed, tests = list[tuple[int, ...]](), np.ones(len(self.terms), bool), self
         sets = tests.sets()
         while sets := [x for x in sets if x.log_odds >= self.least and allowed[list(x.members)].all()]:
-            members = max(sets, key=lambda x: x.log_odds).members
-            impossible = [k for k in members if not tests._is_possible(k, members)]
-            allowed[impossible] = False
-            if impossible:
+            most = max(sets, key=lambda x: x.log_odds)
+            if not all(tests._is_possible(k, most.members) for k in most.members):
+                sets.remove(most)
                 continue
-            replaceable = [tests._is_replaceable(k, members) for k in members]
-            if all(replaceable):
+            is_replaceable = {k: tests._is_replaceable(k, most.members) for k in most.members}
+            if all(is_replaceable.values()):
                 break
-            chosen.append(tuple(members[i] for i in np.argsort(replaceable, kind="stable")))
-            allowed &= ~np.isin(effects, effects[list(members)])
-            tests = tests.beside(*members)
+            alone = {k: x.log_odds for x in tests.alone() for k in x.members}
+            chosen.append(tuple(sorted(most.members, key=lambda k: (is_replaceable[k], -alone[k]))))
+            allowed &= ~np.isin(effects, effects[list(most.members)])
+            tests = tests.beside(*most.members)
             sets = tests.sets()
         return chosen
 
