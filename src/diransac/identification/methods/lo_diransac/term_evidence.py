@@ -40,8 +40,9 @@ if TYPE_CHECKING:
 
 # Prior: RMS force of a term over the largest force of its equation; odds of the terms of a kind and place, together.
 _RELATIVE, _ODDS = 0.1, 1.0
-# Logarithm of the odds of a suggested term, after the choice among all candidates: strong evidence (Kass, Raftery).
-_EVIDENCE = 3.0
+# Logarithm of the odds of a suggested term, after the choice among all candidates: strong evidence (Kass, Raftery).  Of
+# terms whose logarithms differ by less than the other the first counts.
+_EVIDENCE, _EQUAL = 3.0, 0.01
 # Smallest force of a suggested term over the largest one of its equation, and part of the force left that it explains.
 _SMALLEST, _SHARE = 1e-3, 0.2
 # Part of the information of a term that is rounding, and part beside another one that separates both.
@@ -229,7 +230,7 @@ class CandidateTests:
             if part * white[i] <= max(least[i], most - self.least):
                 continue
             one = self._pair(pairs[i])
-            part = part if np.isfinite(most) else float(np.clip(one.log_odds / white[i], 0.0, 1.0))
+            part = part if np.isfinite(most) else max(one.log_odds / white[i], 0.0)
             most = max(most, one.log_odds)
             if one.log_odds > least[i]:
                 found.append(one)
@@ -271,7 +272,8 @@ class CandidateTests:
         chosen, allowed, tests = list[tuple[int, ...]](), np.ones(len(self.terms), bool), self
         sets = tests.sets()
         while sets := [x for x in sets if x.log_odds >= self.least and allowed[list(x.members)].all()]:
-            most = max(sets, key=lambda x: x.log_odds)
+            largest = max(x.log_odds for x in sets)
+            most = min((x for x in sets if x.log_odds > largest - _EQUAL), key=lambda x: x.members)
             if not all(tests._is_possible(k, most.members) for k in most.members):
                 sets.remove(most)
                 continue
