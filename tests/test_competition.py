@@ -254,6 +254,27 @@ def test_a_segment_is_predicted_without_all_blocks_that_it_touches(bound: tuple)
     np.testing.assert_allclose(one.without_blocks(judge.left_out), expected, rtol=1e-12)
 
 
+def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> None:
+    """A fifth of the samples, in bursts that are taken for inliers, would leave nothing to choose."""
+    dataset, intervals, motion, blocks = bound
+    rng, burst = np.random.default_rng(3), np.zeros(len(intervals.measured), bool)
+    for k in rng.integers(0, len(burst), 15):
+        burst[k : k + 40] = True
+    measured = intervals.measured.copy()
+    measured[burst] += 50.0 * motion.spread * rng.uniform(0.5, 1.0, (burst.sum(), 1))
+    spoilt = (dataset, replace(intervals, measured=measured), motion, blocks)
+    competitors = [candidate(str(x), truth() * x, spoilt) for x in (1.0, 1.3, 30.0)]
+    judge = arbiter(spoilt)
+    assert Comparison.of([judge.scores(x) for x in competitors]).as_good[1]
+    fair, found = judge.compared(competitors)
+    assert Comparison.of(found).as_good.tolist() == [True, False, False]
+    assert fair.lost is not None
+    rows = judge.segments.rows[:, judge.n_before :]
+    lost = fair.lost[:, :, 0]
+    assert lost[burst[rows]].mean() > 0.9
+    assert lost[~burst[rows]].mean() < 0.2
+
+
 def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:
     found = arbiter(bound, 0.05)
     assert len(found.horizons) == 1

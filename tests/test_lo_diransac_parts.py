@@ -270,19 +270,16 @@ def at_truth(intervals, signals, noise):
     return Fit(shared, x, d, residuals, ends, mixture, ones, 0.0 * ones, std, sizes, 0.0 * shared)
 
 
-@pytest.mark.parametrize(("noise", "n_steps"), [(1e-3, 2), (1e-13, 5)])
+@pytest.mark.parametrize(("noise", "n_steps"), [(1e-3, 2), (1e-8, 2), (1e-9, 3), (1e-13, 5)])
 def test_integration_steps_are_as_few_as_the_noise_hides(noise, n_steps):
     intervals, signals = intervals_of()
-    fit = at_truth(intervals, signals, noise)
-    found = with_fewest_steps(intervals, fit, 5)
-    assert found.substeps == n_steps
-    change = (found.simulated(fit.shared, fit.x, fit.d)[0] - fit.residuals) / noise
-    assert np.sqrt(np.square(change).sum()) < 0.1
+    assert with_fewest_steps(intervals, at_truth(intervals, signals, noise), 5).substeps == n_steps
 
 
-def test_fewer_integration_steps_move_no_parameter_by_a_tenth_of_its_standard_error(monkeypatch):
+@pytest.mark.parametrize("noise", [1e-3, 1e-7])
+def test_fewer_integration_steps_move_no_parameter_by_a_tenth_of_its_standard_error(monkeypatch, noise):
     signals, inputs = flight(MACHINES["planar-rotorcraft"], 500, 0.01, substeps=5)
-    noisy = signals + 1e-3 * signals.std(axis=0) * np.random.default_rng(3).normal(size=signals.shape)
+    noisy = signals + noise * signals.std(axis=0) * np.random.default_rng(3).normal(size=signals.shape)
     log = as_log(MACHINES["planar-rotorcraft"], noisy, inputs, 0.01)
     few = dr.identify(ROTORCRAFT, log)
     monkeypatch.setattr(integration_steps, "_FEW", ())

@@ -34,7 +34,11 @@ _SCALES = (0.125, 0.5, 2.0, 8.0)
 """Horizons over the time in which signals change by half of what they ever do."""
 _FEWEST_ROWS, _PART = 4, 3
 """Rows of the shortest horizon, and stretches over segments at least."""
-_LOST = 1e4
+_LOST, _TINY = 1e4, 1e-300
+_GOOD = 10.0
+"""Factor of the best candidate's median errors up to which another one is good."""
+_MOST_ROWS = 512
+"""Rows of a segment that are compared, at most: the errors of all candidates are in memory together."""
 _AS_WELL = 0.02
 """Difference of the logarithms of losses that does not count."""
 _NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
@@ -166,6 +170,8 @@ class Arbiter:
         Samples that are no outliers.
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
+    lost : (K, n_after, n_s) bool array, optional
+        Predicted samples that do not count; None before candidates are compared.
     """
 
     segments: Segments
@@ -176,6 +182,7 @@ class Arbiter:
     motion: Motion
     inlying: BoolArray
     noise: FloatArray
+    lost: BoolArray | None = None
 
     @classmethod
     def of(
@@ -209,41 +216,79 @@ class Arbiter:
         return tuple(float(n * self.segments.intervals.dt) for n in self.steps)
 
     @cached_property
-    def _known(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
-        one = self.segments
-        known = (one.intervals.sampled & self.inlying)[one.rows][:, self.n_before :][:, :, one.columns]
-        return np.asarray(known & _predicted(one))
+    def _after(self) -> slice:
+        """Rows of a segment that are predicted and compared."""
+        return slice(self.n_before, None, -(-self.steps[-1] // _MOST_ROWS))
 
     @cached_property
-    def _counts(self) -> list[IntArray]:
-        """Numbers ``(K, n_s)`` of these samples, by horizon."""
-        return [self._known[:, :n].sum(axis=1) for n in self.steps]
+    def _counts(self) -> list[int]:
+        """Numbers of these rows, by horizon."""
+        return [-(-n // self._after.step) for n in self.steps]
+
+    @cached_property
+    def _sampled(self) -> BoolArray:
+        """Mask ``(K, n_rows, n_s)`` of the samples of the segments that are no outliers."""
+        one = self.segments
+        return (one.intervals.sampled & self.inlying)[one.rows][:, :, one.columns]
+
+    @cached_property
+    def _known(self) -> BoolArray:
+        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
+        known = self._sampled[:, self._after] & _predicted(self.segments)
+        return np.asarray(known if self.lost is None else known & ~self.lost)
 
     @cached_property
     def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
         """Spread ``(n_s,)`` of the signals, and RMS errors of the prediction that nothing changes, by horizon."""
         one, n_before = self.segments, self.n_before
-        y = np.where(one.intervals.sampled & self.inlying, one.intervals.measured, np.nan)[:, one.columns][one.rows]
+        y = np.where(self._sampled, one.intervals.measured[:, one.columns][one.rows], np.nan)
         few = max(1, min(3, n_before))
         last = np.stack([_medians(x) for x in y[:, n_before - few : n_before]])[:, None]
-        flat = y.reshape(-1, y.shape[2])
+        after = np.where(self._known, y[:, self._after], np.nan)
+        flat = after.reshape(-1, y.shape[2])
         spread = _root_mean_squares(flat - _medians(flat))
         spread = np.where(spread > 0.0, spread, 1.0)
-        changes = [(y[:, n_before : n_before + n] - last).reshape(-1, y.shape[2]) for n in self.steps]
+        changes = [(after[:, :n] - last).reshape(-1, y.shape[2]) for n in self._counts]
         return spread, [np.where(size > 0.0, size, spread) for size in map(_root_mean_squares, changes)]
+
+    def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
+        """The arbiter without samples that no good candidate predicts, and the predictions of the others by all.
+
+        Such a sample, further from every prediction than from a constant, is an outlier, or follows a state that
+        outliers hide: it tells nothing of the candidates.  A bad candidate may be near it by chance.
+
+        Parameters
+        ----------
+        candidates : sequence of Candidate
+
+        Returns
+        -------
+        Arbiter, list of Scores
+        """
+        errors = [self._errors(x) for x in candidates]
+        medians = np.array([np.log(self._scores(x).errors + _TINY).mean() for x in errors])
+        best = np.nanmin(medians, initial=np.inf)
+        good = [x for x, median in zip(errors, medians, strict=True) if median <= best + np.log(_GOOD)]
+        fair, nearest = self, np.abs(good).min(axis=0) if good else np.zeros(1)
+        while (lost := nearest > fair._sizes[0]).sum() > (0 if fair.lost is None else fair.lost.sum()):
+            fair = replace(self, lost=lost)
+        return fair, [fair._scores(x) for x in errors]
 
     def scores(self, candidate: Candidate) -> Scores:
         """Predictions of a candidate, each segment by its estimate without the blocks of the segment.
 
         The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
         """
+        return self._scores(self._errors(candidate))
+
+    def _scores(self, errors: FloatArray) -> Scores:
+        """Scores of errors ``(K, n_after, n_s)``."""
         spread, no_change = self._sizes
         losses, found = list[FloatArray](), list[FloatArray]()
-        squares = np.where(self._known, np.square(self._errors(candidate)), 0.0)
-        for n, count, size in zip(self.steps, self._counts, no_change, strict=True):
-            mse = squares[:, :n].sum(axis=1) / np.maximum(count, 1)
-            mse = np.where(count > 0, mse, np.nan)
+        squares = np.where(self._known, np.square(errors), 0.0)
+        for n, size in zip(self._counts, no_change, strict=True):
+            count = self._known[:, :n].sum(axis=1)
+            mse = np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan)
             losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
             found.append(_medians(mse / np.square(size)))
         by_horizon = _means(np.array(losses))
@@ -260,7 +305,7 @@ class Arbiter:
         states, spread = prior_states(intervals, self.motion, self.inlying, segments.starts)
         before = replace(segments, n_rows=self.n_before)
         states = before.estimated_states(lanes, states[None], spread, weights)
-        return np.asarray(segments.errors(lanes, states)[0][:, self.n_before :])
+        return np.array(segments.errors(lanes, states)[0][:, self._after])
 
 
 def _means(values: FloatArray) -> FloatArray:

@@ -321,8 +321,10 @@ class Contest:
         inlying, noise = self._noise_of(search)
         acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
         arbiter = Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
-        scores = [] if arbiter is None else [arbiter.scores(x) for x in self.candidates]
-        if arbiter is None or not any(np.isfinite(x.losses).any() for x in scores):
+        if arbiter is None:
+            return None
+        arbiter, scores = arbiter.compared(self.candidates)
+        if not any(np.isfinite(x.losses).any() for x in scores):
             return None
         judged = _Judgement(arbiter, scores, Comparison.of(scores))
         best = judged.comparison.best
