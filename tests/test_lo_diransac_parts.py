@@ -575,6 +575,19 @@ def test_delays_that_are_withdrawn_have_no_effect_on_a_covariance():
     assert not effect_on(none, None, np.ones((8, 3, 2)), np.ones((4, 2))).any()
 
 
+def test_weights_follow_their_samples_where_a_delay_passes_half_a_sample():
+    """An outlier that lost its weight to its neighbour would forbid the step."""
+    intervals, signals = intervals_of()
+    kind, rates = ErrorKind((2,), "delay"), np.gradient(signals, axis=0)
+    punctual, late = (intervals.corrected({kind: x}, rates) for x in (0.4, 0.6))
+    weights = np.tile(np.arange(1.0, 201.0)[:, None], 9)
+    assert punctual.weights_in(punctual, weights) is weights
+    found = punctual.weights_in(late, weights)
+    np.testing.assert_array_equal(np.delete(found, 2, axis=1), np.delete(weights, 2, axis=1))
+    assert found[:, 2].tolist() == [*range(2, 201), 0]
+    assert late.weights_in(punctual, found)[:, 2].tolist() == [0, *range(2, 201)]
+
+
 # ---------------------------------------------------------------------- screening
 
 

@@ -444,7 +444,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             if there is None:
                 break
             trial = _moved(there, fit, step.of_fit)
-            more = cost(there, trial, weights) - before
+            more = cost(there, trial, intervals.weights_in(there, weights)) - before
             if more <= 1e-9 * before:
                 least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
                 of_errors = float((np.abs(step.sizes) / step.std).max(initial=0.0))

@@ -252,15 +252,27 @@ class ShootingIntervals:
         ShootingIntervals
         """
         errors = self.all_errors.plus(more)
-        measured, sampled = errors.measured.copy(), errors.sampled.copy()
-        for i, whole in enumerate(np.round(errors.delay).astype(int)):
-            for rows in self.rows_of_logs:
-                at = np.arange(rows.start, rows.stop) + whole
-                inside = (at >= rows.start) & (at < rows.stop)
-                at = np.clip(at, rows.start, rows.stop - 1)
-                measured[rows, i], sampled[rows, i] = errors.measured[at, i], errors.sampled[at, i] & inside
-        measured += (errors.delay - np.round(errors.delay)) * rates - errors.bias
+        whole = np.round(errors.delay)
+        rows = self._rows_later(whole)
+        measured = np.take_along_axis(errors.measured, rows, axis=0)
+        sampled = np.take_along_axis(errors.sampled, rows, axis=0) & (rows >= 0)
+        measured += (errors.delay - whole) * rates - errors.bias
         return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, errors=errors)
+
+    def weights_in(self, other: ShootingIntervals, weights: FloatArray) -> FloatArray:
+        """Weights ``(N, n_s)`` of the samples in the rows that they have in other intervals, with other delays."""
+        later = np.round(other.all_errors.delay) - np.round(self.all_errors.delay)
+        if not later.any():
+            return weights
+        rows = self._rows_later(later)
+        return np.where(rows >= 0, np.take_along_axis(weights, rows, axis=0), 0.0)
+
+    def _rows_later(self, whole: FloatArray) -> IntArray:
+        """Row ``(N, n_s)`` of the same log by a number of samples later, for each signal; -1 where there is none."""
+        own, last = self.log_of_row[:, None], len(self.recorded) - 1
+        later = np.arange(last + 1)[:, None] + whole.astype(int)
+        at = np.clip(later, 0, last)
+        return np.where((at == later) & (self.log_of_row[at] == own), at, -1)
 
     def with_input_error(self, kind: ErrorKind, size: float) -> ShootingIntervals:
         """The intervals with another error of an input, and measurements as they are.
