@@ -4,6 +4,7 @@ The machine is a pendulum under a held command, simulated by small steps of its 
 delay or a first-order lag, which are exact at a tenth of a sample.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -15,6 +16,8 @@ import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.data.input_timing import InputTiming, acting_inputs
 from diransac.errors import SettingsError
+from diransac.identification.methods.lo_diransac.preparation import prepared
+from diransac.identification.methods.lo_diransac.search import searched
 
 DT, FINE = 0.01, 10
 TRUE = {"inertia": 0.5, "damping": 0.4, "weight": 4.0}
@@ -400,3 +403,23 @@ def test_a_sensor_that_the_log_lacks_is_refused_by_name():
         estimate(pendulum_log(), sensor_biases=("x",))
     with pytest.raises(SettingsError, match=r'gain_drifts names "angle", which .* lacks; it has torque'):
         estimate(pendulum_log(), gain_drifts=("angle",))
+
+
+def test_a_search_that_is_behind_before_errors_of_recordings_tries_none():
+    log = pendulum_log()
+    late = {"angle_ddot": np.r_[np.full(3, np.nan), log["angle_ddot"][:-3]]}
+    signals = {name: log[name] for name in ("angle", "angle_dot", "torque")} | late
+    dataset, settings = Dataset.of(MODEL, dr.Log.from_arrays(log.time, signals), pointwise=False), dr.LoDiransac()
+    whole = prepared(settings, dataset)
+    found = searched(settings, *whole, 0, dataset, None).likeliest
+    assert [x.what for x in found.intervals.all_errors.kinds] == ["delay"]
+    assert found.cost < found.cost_before_errors - 100.0
+
+    def beside(ahead):
+        rival = replace(found, cost_before_errors=found.cost_before_errors - ahead)
+        return searched(settings, *whole, 0, dataset, None, rival=rival).likeliest
+
+    assert beside(4.0).cost == found.cost
+    behind = beside(6.0)
+    assert behind.cost == found.cost_before_errors
+    assert not behind.intervals.all_errors.kinds

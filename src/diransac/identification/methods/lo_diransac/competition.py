@@ -253,7 +253,7 @@ class Contest:
             return first
         best = self._best_other(judged)
         if best is not None and (first is None or self.is_challenged(first, judged, best)):
-            other = self._searched_from(best, notes)
+            other = self._searched_from(best, notes, None if first is None else first.likeliest)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
                 found = other
         if found is None:
@@ -295,7 +295,7 @@ class Contest:
         impossible = search.impossible if of_fit else ()
         return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
-    def _searched_from(self, best: int, notes: tuple[str, ...]) -> Searched | None:
+    def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""
         one, motion = self.entries[best]
         assert isinstance(motion, Motion)
@@ -305,7 +305,7 @@ class Contest:
         try:
             return searched(
                 self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
-                within(self.callback, 0.89, 0.895), hypotheses=one.parameters[None],
+                within(self.callback, 0.89, 0.895), one.parameters[None], rival,
             )  # fmt: skip
         except (IdentificationError, np.linalg.LinAlgError):
             return None

@@ -70,11 +70,14 @@ class Explanation:
         Whether the fit is one of the model as it is.
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
+    cost_before_errors : float, optional
+        Cost of the likeliest explanation before its search tried further errors of the recordings.
     """
 
     refinement: Refinement
     exact: bool
     complete: bool = True
+    cost_before_errors: float = np.inf
 
     @property
     def intervals(self) -> ShootingIntervals:
@@ -121,7 +124,9 @@ class LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def likeliest(self, intervals: ShootingIntervals, *, free_hold: bool) -> Explanation:
+    def likeliest(
+        self, intervals: ShootingIntervals, *, free_hold: bool, rival: Explanation | None = None
+    ) -> Explanation:
         """The likeliest explanation of the log.
 
         Parameters
@@ -130,6 +135,8 @@ class LocalSearch:
             With inputs as recorded.
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
+        rival : Explanation, optional
+            Of another search: this one tries no further errors of the recordings where it is less likely before.
 
         Returns
         -------
@@ -142,7 +149,7 @@ class LocalSearch:
         """
         best: Explanation | None = None
         try:
-            for found in self._ever_likelier(intervals, free_hold=free_hold):
+            for found in self._ever_likelier(intervals, rival, free_hold=free_hold):
                 best = found
         except TimeLimitError:
             if best is None:
@@ -154,23 +161,28 @@ class LocalSearch:
         assert best is not None
         return best
 
-    def _ever_likelier(self, intervals: ShootingIntervals, *, free_hold: bool) -> Iterator[Explanation]:
+    def _ever_likelier(
+        self, intervals: ShootingIntervals, rival: Explanation | None, *, free_hold: bool
+    ) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
         yield self._shown(flexible, 0.35)
         best = self._accurate(self._simplest(flexible))
-        yield self._shown(best, 0.6)
+        before = best.cost
+        yield self._shown(replace(best, cost_before_errors=before), 0.6)
+        if rival is not None and before > rival.cost_before_errors + AS_LIKELY:
+            return
         named = self._named(intervals)
         if named:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
-            yield best
+            yield replace(best, cost_before_errors=before)
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:
                 break
             best = self._accurate(min(found, key=lambda x: x.cost))
-            yield self._shown(best, 0.6 + 0.03 * k)
+            yield self._shown(replace(best, cost_before_errors=before), 0.6 + 0.03 * k)
 
     def _shown(self, found: Explanation, fraction: float) -> Explanation:
         """The explanation itself, which is reported as the best so far."""

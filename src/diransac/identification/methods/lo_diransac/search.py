@@ -232,8 +232,9 @@ def searched(
     dataset: Dataset,
     callback: Callback | None,
     hypotheses: FloatArray | None = None,
+    rival: Explanation | None = None,
 ) -> Searched:
-    """A search that begins with a motion, and with hypotheses or samples."""
+    """A search that begins with a motion, and with hypotheses or samples; a rival ends it early, as in `likeliest`."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     n_spikes = 0
@@ -250,7 +251,7 @@ def searched(
             f"{len(hypotheses)} samples of the parameters; compare the model with the machine, or bound them"
         )
     search = LocalSearch(settings, motion, able, prior, callback)
-    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None)
+    likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, rival=rival)
     return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
 
 
