@@ -30,11 +30,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from gauntlet_studies import study_of
 from real import DATA, RECORDS, Record, logs_of, scores_of
 from regime_flights import REGIMES, recordings
 
 import diransac as dr
 from diransac.identification.methods.lo_diransac.arbiter import Comparison
+from diransac.study import trial_data
 from simulated import MACHINES, as_log, flight
 
 METHOD = "diransac.identification.methods.lo_diransac"
@@ -98,6 +100,7 @@ def _parts() -> dict[str, Part]:
         "simulation error": _without_source("simulation error"),
         "second fit": Part(patches=(("competition.Contest.is_challenged", lambda *_: False),)),
         "competition": Part(replace(DEFAULT, sources=())),
+        "samples that nobody predicts do not count": Part(patches=(("arbiter._GOOD", 1e-300),)),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
         "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
         "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),
@@ -167,7 +170,10 @@ def machine_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
 
 
 def corrupted_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
-    """A flight of the planar rotorcraft with outliers, leverage, the noise of Table III, stuck samples, and a lift."""
+    """A flight of the planar rotorcraft with outliers, leverage, the noise of Table III, stuck samples, and a lift.
+
+    Leverage of a double pendulum is that of the robustness benchmark (`gauntlet`): a fit follows outliers there.
+    """
     machine, model, dt = MACHINES["planar-rotorcraft"], dr.models.planar_rotorcraft(), 0.01
     clean, lifted = (flight(x, 2500, dt) for x in (machine, replace(machine, acceleration=_lifted)))
     regressors, known = machine.rows(*lifted)
@@ -179,6 +185,11 @@ def corrupted_runs(seeds: Sequence[int]) -> Iterator[tuple[str, Run]]:
             truth = pseudo_true if name == "lift" else machine.truth
             log = as_log(machine, signals, inputs, dt)
             yield f"corrupted/{name}/{seed}", partial(_error, model, log, truth)
+    pendulum = study_of("double-pendulum")
+    for seed in seeds:
+        data = trial_data(pendulum, "leverage", seed)
+        run = partial(_error, pendulum.plant.plant.model, data.log, data.pseudo_true)
+        yield f"corrupted/double pendulum, leverage/{seed}", run
 
 
 def _lifted(q: object, v: object, u: object, p: object) -> tuple[float, ...]:
