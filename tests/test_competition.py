@@ -262,9 +262,9 @@ def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> No
         burst[k : k + 40] = True
     measured = intervals.measured.copy()
     measured[burst] += 50.0 * motion.spread * rng.uniform(0.5, 1.0, (burst.sum(), 1))
-    spoilt = (dataset, replace(intervals, measured=measured), motion, blocks)
-    competitors = [candidate(str(x), truth() * x, spoilt) for x in (1.0, 1.3, 30.0)]
-    judge = arbiter(spoilt)
+    with_bursts = (dataset, replace(intervals, measured=measured), motion, blocks)
+    competitors = [candidate(str(x), truth() * x, with_bursts) for x in (1.0, 1.3, 30.0)]
+    judge = arbiter(with_bursts)
     assert Comparison.of([judge.scores(x) for x in competitors]).as_good[1]
     fair, found = judge.compared(competitors)
     assert Comparison.of(found).as_good.tolist() == [True, False, False]
@@ -273,6 +273,25 @@ def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> No
     lost = fair.lost[:, :, 0]
     assert lost[burst[rows]].mean() > 0.9
     assert lost[~burst[rows]].mean() < 0.2
+
+
+def test_samples_count_where_every_estimate_predicts_badly(bound: tuple) -> None:
+    judge = arbiter(bound)
+    bad = [candidate(str(k), truth() * [1.0, 1.0, k, 1.0], bound) for k in (0.3, 2.5)]
+    fair, found = judge.compared(bad)
+    assert fair.lost is None
+    assert [x.errors.tolist() for x in found] == [judge.scores(x).errors.tolist() for x in bad]
+
+
+def test_blocks_in_which_the_best_estimate_fails_count_where_another_one_predicts_them(bound: tuple) -> None:
+    """Two regimes in a log: one estimate is exact in six of ten blocks, the other one fair in all."""
+    failing = np.tile(truth(), (bound[3].n, 1))
+    failing[:4, 2] *= 2.0
+    one, other = candidate("one", truth(), bound, failing), candidate("other", truth() * 1.1, bound)
+    judge = arbiter(bound)
+    _, found = judge.compared([one, other])
+    assert (found[0].errors < 0.5 * found[1].errors).all()
+    assert Comparison.of(found).losses == pytest.approx(Comparison.of([judge.scores(x) for x in (one, other)]).losses)
 
 
 def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:

@@ -273,7 +273,12 @@ def at_truth(intervals, signals, noise):
 @pytest.mark.parametrize(("noise", "n_steps"), [(1e-3, 2), (1e-8, 2), (1e-9, 3), (1e-13, 5)])
 def test_integration_steps_are_as_few_as_the_noise_hides(noise, n_steps):
     intervals, signals = intervals_of()
-    assert with_fewest_steps(intervals, at_truth(intervals, signals, noise), 5).substeps == n_steps
+    fit = at_truth(intervals, signals, noise)
+    found, moved = with_fewest_steps(intervals, fit, 5)
+    assert found.substeps == n_steps
+    weights = np.full_like(signals, noise**-2.0)
+    assert cost(found, moved, weights) <= cost(found, with_residuals(found, fit), weights)
+    assert cost(found, moved, weights) < 1.0 or n_steps == 5
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-7])

@@ -197,7 +197,7 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     for hold in others:
         other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
         best = other if other.cost < best.cost - AS_LIKELY else best
-    few = with_fewest_steps(best.setup.intervals(stream, first, n), best.fit, setup.settings.substeps).substeps
+    few = with_fewest_steps(best.setup.intervals(stream, first, n), best.fit, setup.settings.substeps)[0].substeps
     begun_setup = replace(best.setup, settings=replace(setup.settings, substeps=few))
     return Window(begun_setup, stream, first, best.fit, motion.spread, most)
 

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.segments import Segments, prior_states, stretches
+from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.methods.lo_diransac.segments import OUTLYING, Segments, prior_states, stretches
 from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ _FEWEST_ROWS, _PART = 4, 3
 """Rows of the shortest horizon, and stretches over segments at least."""
 _LOST, _TINY = 1e4, 1e-300
 _GOOD = 10.0
-"""Factor of the best candidate's median errors up to which another one is good."""
-_MOST_ROWS = 512
-"""Rows of a segment that are compared, at most: the errors of all candidates are in memory together."""
+"""Factor of the least median error in a block up to which a candidate is good there."""
+_MOST_ROWS = 100_000
+"""Rows that are compared, at most: the errors of all candidates are in memory together."""
 _AS_WELL = 0.02
 """Difference of the logarithms of losses that does not count."""
 _NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
@@ -171,7 +172,7 @@ class Arbiter:
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
     lost : (K, n_after, n_s) bool array, optional
-        Predicted samples that do not count; None before candidates are compared.
+        Samples whose losses do not count; None before candidates are compared.
     """
 
     segments: Segments
@@ -218,10 +219,10 @@ class Arbiter:
     @cached_property
     def _after(self) -> slice:
         """Rows of a segment that are predicted and compared."""
-        return slice(self.n_before, None, -(-self.steps[-1] // _MOST_ROWS))
+        return slice(self.n_before, None, -(-self.steps[-1] * len(self.segments) // _MOST_ROWS))
 
     @cached_property
-    def _counts(self) -> list[int]:
+    def _n_rows(self) -> list[int]:
         """Numbers of these rows, by horizon."""
         return [-(-n // self._after.step) for n in self.steps]
 
@@ -233,29 +234,43 @@ class Arbiter:
 
     @cached_property
     def _known(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
-        known = self._sampled[:, self._after] & _predicted(self.segments)
-        return np.asarray(known if self.lost is None else known & ~self.lost)
+        """Mask ``(K, n_after, n_s)`` of the samples to predict."""
+        return np.asarray(self._sampled[:, self._after] & _predicted(self.segments))
 
     @cached_property
-    def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
-        """Spread ``(n_s,)`` of the signals, and RMS errors of the prediction that nothing changes, by horizon."""
-        one, n_before = self.segments, self.n_before
-        y = np.where(self._sampled, one.intervals.measured[:, one.columns][one.rows], np.nan)
-        few = max(1, min(3, n_before))
-        last = np.stack([_medians(x) for x in y[:, n_before - few : n_before]])[:, None]
-        after = np.where(self._known, y[:, self._after], np.nan)
-        flat = after.reshape(-1, y.shape[2])
+    def _counted(self) -> BoolArray:
+        """Mask ``(K, n_after, n_s)`` of the samples whose losses count."""
+        return self._known if self.lost is None else self._known & ~self.lost
+
+    @cached_property
+    def _measured(self) -> FloatArray:
+        """Samples ``(K, n_rows, n_s)`` of the segments; NaN for outliers."""
+        one = self.segments
+        return np.where(self._sampled, one.intervals.measured[:, one.columns][one.rows], np.nan)
+
+    @cached_property
+    def _spread(self) -> FloatArray:
+        """Spread ``(n_s,)`` of the samples that count."""
+        y = np.where(self._counted, self._measured[:, self._after], np.nan)
+        flat = y.reshape(-1, y.shape[2])
         spread = _root_mean_squares(flat - _medians(flat))
-        spread = np.where(spread > 0.0, spread, 1.0)
-        changes = [(after[:, :n] - last).reshape(-1, y.shape[2]) for n in self._counts]
-        return spread, [np.where(size > 0.0, size, spread) for size in map(_root_mean_squares, changes)]
+        return np.where(spread > 0.0, spread, 1.0)
+
+    @cached_property
+    def _no_change(self) -> list[FloatArray]:
+        """RMS errors ``(n_s,)`` of the prediction that nothing changes, by horizon."""
+        n, few = self.n_before, max(1, min(3, self.n_before))
+        last = np.stack([_medians(x) for x in self._measured[:, n - few : n]])[:, None]
+        apart = np.where(self._known, self._measured[:, self._after] - last, np.nan)
+        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, apart.shape[2])) for n in self._n_rows]
+        return [np.where(size > 0.0, size, self._spread) for size in sizes]
 
     def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
-        """The arbiter without samples that no good candidate predicts, and the predictions of the others by all.
+        """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
 
-        Such a sample, further from every prediction than from a constant, is an outlier, or follows a state that
-        outliers hide: it tells nothing of the candidates.  A bad candidate may be near it by chance.
+        Such a sample is an outlier, or a state that outliers hide led all simulations astray.  The good candidates of a
+        block are those whose median error there is at most ten times the least.  All of them miss a lost sample by more
+        than the spread of its signal, and by six times what they leave of the others.
 
         Parameters
         ----------
@@ -266,12 +281,16 @@ class Arbiter:
         Arbiter, list of Scores
         """
         errors = [self._errors(x) for x in candidates]
-        medians = np.array([np.log(self._scores(x).errors + _TINY).mean() for x in errors])
-        best = np.nanmin(medians, initial=np.inf)
-        good = [x for x, median in zip(errors, medians, strict=True) if median <= best + np.log(_GOOD)]
-        fair, nearest = self, np.abs(good).min(axis=0) if good else np.zeros(1)
-        while (lost := nearest > fair._sizes[0]).sum() > (0 if fair.lost is None else fair.lost.sum()):
-            fair = replace(self, lost=lost)
+        medians = np.array([self._block_medians(x) for x in errors])
+        nearest = np.full(self._known.shape, np.inf)
+        for good, one in zip(medians <= _GOOD * np.fmin.reduce(medians), errors, strict=True):
+            own = good[self.block]
+            nearest[own] = np.minimum(nearest[own], np.abs(one[own]))
+        columns = (-1, len(self._spread))
+        left = lower_scale(nearest.reshape(columns), self._known.reshape(columns))
+        least, fair, n_lost = OUTLYING * np.nan_to_num(left, nan=np.inf), self, 0
+        while (lost := self._known & (nearest > np.maximum(fair._spread, least))).sum() > n_lost:
+            fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
     def scores(self, candidate: Candidate) -> Scores:
@@ -283,18 +302,30 @@ class Arbiter:
 
     def _scores(self, errors: FloatArray) -> Scores:
         """Scores of errors ``(K, n_after, n_s)``."""
-        spread, no_change = self._sizes
-        losses, found = list[FloatArray](), list[FloatArray]()
-        squares = np.where(self._known, np.square(errors), 0.0)
-        for n, size in zip(self._counts, no_change, strict=True):
-            count = self._known[:, :n].sum(axis=1)
-            mse = np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan)
-            losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
-            found.append(_medians(mse / np.square(size)))
-        by_horizon = _means(np.array(losses))
-        blocks = range(self.left_out.shape[1])
-        of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in blocks]).T
+        mse = self._mean_squares(errors, self._counted) / np.square(self._spread)
+        by_horizon = _means(np.log1p(np.minimum(mse, _LOST)))
+        of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
+        found = [_medians(x) for x in self._relative(errors)]
         return Scores(np.sqrt(_means(np.array(found))), of_blocks)
+
+    def _block_medians(self, errors: FloatArray) -> FloatArray:
+        """Geometric means over the horizons of the median errors ``(n_blocks,)`` in each block."""
+        relative = self._relative(errors)
+        blocks = [relative[:, self.block == k] for k in range(self.left_out.shape[1])]
+        medians = np.array([[_means(_medians(x)) for x in one] for one in blocks])
+        return np.exp(0.5 * _means(np.log(medians + _TINY)))
+
+    def _relative(self, errors: FloatArray) -> FloatArray:
+        """Mean squares ``(n_horizons, K, n_s)`` of errors over those of the prediction that nothing changes."""
+        return self._mean_squares(errors, self._known) / np.square(np.array(self._no_change)[:, None])
+
+    def _mean_squares(self, errors: FloatArray, known: BoolArray) -> FloatArray:
+        """Mean squares ``(n_horizons, K, n_s)`` of errors of the samples that are known; NaN where none is."""
+        squares, found = np.where(known, np.square(errors), 0.0), list[FloatArray]()
+        for n in self._n_rows:
+            count = known[:, :n].sum(axis=1)
+            found.append(np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan))
+        return np.array(found)
 
     def _errors(self, candidate: Candidate) -> FloatArray:
         """Errors ``(K, n_after, n_s)`` of the predicted rows."""
@@ -317,6 +348,8 @@ def _means(values: FloatArray) -> FloatArray:
 
 def _medians(values: FloatArray) -> FloatArray:
     """Medians ``(n,)`` of the finite numbers of each column; NaN where there are none."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
     known = np.isfinite(values)
     ordered, count = np.sort(np.where(known, values, np.nan), axis=0), known.sum(axis=0)
     middle = (ordered[np.maximum(k, 0), np.arange(len(count))] for k in ((count - 1) // 2, count // 2))

@@ -1,7 +1,7 @@
-"""Integration steps per sample: as few as leave every parameter and the evidence where they are.
+"""Integration steps per sample: as few as leave every parameter of a fit, and the evidence, where they are.
 
 Fewer steps change the residuals of a fit and the ends of its intervals.  The Gauss-Newton step that answers this change
-tells how far the parameters of the fit would move, and how much its cost would change.
+has the changes of the parameters and of the cost, and leads to the optimum with fewer steps.
 """
 
 from __future__ import annotations
@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.identification.methods.lo_diransac.normal_equations import data_gradient, linearize, weights_of
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    data_gradient,
+    linearize,
+    weights_of,
+    with_residuals,
+)
+from diransac.identification.methods.lo_diransac.refinement import after_step
 
 if TYPE_CHECKING:
-    from diransac.arrays import FloatArray
+    from diransac.identification.methods.lo_diransac.arrowhead import Factored
     from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
@@ -24,8 +30,8 @@ _NEGLIGIBLE, _NEGLIGIBLE_COST = 0.1, 0.5
 _FEW = (2, 3)
 
 
-def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> ShootingIntervals:
-    """The intervals with the fewest integration steps per sample by which no parameter changes noticeably.
+def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tuple[ShootingIntervals, Fit]:
+    """The intervals with the fewest integration steps per sample by which no parameter of the fit changes noticeably.
 
     Parameters
     ----------
@@ -37,31 +43,33 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> Shoo
 
     Returns
     -------
-    ShootingIntervals
+    ShootingIntervals, Fit
+        The fit is at its optimum with these steps; only simulated again with `most` of them.
     """
     finest = replace(intervals, substeps=most)
-    simulated, at = finest.simulated(fit.shared, fit.x, fit.d), linearize(intervals, fit, weights_of(intervals, fit))
+    accurate = with_residuals(finest, fit)
+    at = linearize(intervals, fit, weights_of(intervals, fit))
     for n in _FEW:
         if n >= most:
             break
         other = replace(intervals, substeps=n)
-        residuals, ends = (a - b for a, b in zip(other.simulated(fit.shared, fit.x, fit.d), simulated, strict=True))
-        moved, change = _answer(intervals, fit, at, residuals, ends)
-        if (moved < _NEGLIGIBLE).all() and abs(change) < _NEGLIGIBLE_COST:
-            return other
-    return finest
+        changed = with_residuals(other, fit)
+        step, cost = _answer(intervals, at, accurate, changed)
+        change = np.abs(step.step_p) / np.sqrt(np.diag(step.var_p))
+        if (change[: intervals.n_p] < _NEGLIGIBLE).all() and abs(cost) < _NEGLIGIBLE_COST:
+            return other, after_step(other, fit, step)
+    return finest, accurate
 
 
-def _answer(
-    intervals: ShootingIntervals, fit: Fit, at: NormalEquations, residuals: FloatArray, ends: FloatArray
-) -> tuple[FloatArray, float]:
-    """Changes ``(n,)`` of the parameters, standard errors, and of the cost, if residuals and ends change."""
-    k, jumps = intervals.n_p, np.where(intervals.linked[:, None], -ends[:-1], 0.0)
-    z, s = data_gradient(intervals, fit, at.weights, intervals.measured - residuals)
+def _answer(intervals: ShootingIntervals, at: NormalEquations, fit: Fit, changed: Fit) -> tuple[Factored, float]:
+    """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats."""
+    own = changed.residuals - fit.residuals
+    jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - changed.ends[:-1], 0.0)
+    z, s = data_gradient(intervals, fit, at.weights, intervals.measured - own)
     by_jumps_z, by_jumps_s = at.by_jumps(intervals, jumps)
     right_z, right_s = z - at.data_z - by_jumps_z, (s - at.data_s).sum(axis=0) - by_jumps_s
-    solved = at.system.solve(right_z, right_s)
-    change = (at.weights * residuals * (fit.residuals + 0.5 * residuals)).sum()
-    change += (at.precision * jumps * (at.jumps + 0.5 * jumps)).sum()
-    change -= 0.5 * ((right_z * solved.step_z).sum() + right_s @ solved.step_p)
-    return np.abs(solved.step_p[:k]) / np.sqrt(np.diag(solved.var_p)[:k]), float(change)
+    step = at.system.solve(right_z, right_s)
+    cost = (at.weights * own * (fit.residuals + 0.5 * own)).sum()
+    cost += (at.precision * jumps * (at.jumps + 0.5 * jumps)).sum()
+    cost -= 0.5 * ((right_z * step.step_z).sum() + right_s @ step.step_p)
+    return step, float(cost)

@@ -71,7 +71,7 @@ class Explanation:
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
     cost_before_errors : float, optional
-        Cost of the likeliest explanation before its search tried further errors of the recordings.
+        Cost of the likeliest explanation, with errors of the recordings that settings name, before others were sought.
     """
 
     refinement: Refinement
@@ -136,7 +136,8 @@ class LocalSearch:
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
         rival : Explanation, optional
-            Of another search: this one tries no further errors of the recordings where it is less likely before.
+            Outcome of another search.  Where it was likelier before errors of the recordings were sought, this search
+            ends there.
 
         Returns
         -------
@@ -168,14 +169,14 @@ class LocalSearch:
         flexible = self._accurate(self._from_hypothesis(intervals))
         yield self._shown(flexible, 0.35)
         best = self._accurate(self._simplest(flexible))
-        before = best.cost
-        yield self._shown(replace(best, cost_before_errors=before), 0.6)
-        if rival is not None and before > rival.cost_before_errors + AS_LIKELY:
-            return
+        yield self._shown(best, 0.6)
         named = self._named(intervals)
         if named:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
-            yield replace(best, cost_before_errors=before)
+        before = best.cost
+        yield replace(best, cost_before_errors=before)
+        if rival is not None and before > rival.cost_before_errors + AS_LIKELY:
+            return
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
@@ -317,13 +318,12 @@ class LocalSearch:
     def _accurate(self, found: Explanation) -> Explanation:
         """The explanation with the fewest integration steps that it admits; fitted again if these are more."""
         intervals, fit = found.intervals, found.refinement.fit
-        other = with_fewest_steps(intervals, fit, self.settings.substeps)
+        other, moved = with_fewest_steps(intervals, fit, self.settings.substeps)
         if other.substeps == intervals.substeps:
             return found
-        again = with_residuals(other, fit)
         if other.substeps > intervals.substeps:
-            return self._optimised(found, other, again)
-        return replace(found, refinement=replace(found.refinement, intervals=other, fit=again))
+            return self._optimised(found, other, moved)
+        return replace(found, refinement=replace(found.refinement, intervals=other, fit=moved))
 
     def _simplified(self, found: Explanation) -> Explanation:
         """The explanation without the freedom that is no longer likely."""

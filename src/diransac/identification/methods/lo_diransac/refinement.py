@@ -443,7 +443,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
             there = at.moved(intervals, step)
             if there is None:
                 break
-            trial = _moved(there, fit, step.of_fit)
+            trial = after_step(there, fit, step.of_fit)
             more = cost(there, trial, intervals.weights_in(there, weights)) - before
             if more <= 1e-9 * before:
                 least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
@@ -456,8 +456,20 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
     return Step(intervals, fit, at, step, damping, damping, 0.0)
 
 
-def _moved(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
-    """The fit after a step whose shared unknowns stay within their bounds."""
+def after_step(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
+    """The fit after a step whose shared unknowns stay within their bounds.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+        Over which it is simulated then.
+    fit : Fit
+    step : Factored
+
+    Returns
+    -------
+    Fit
+    """
     shared, n_x = bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
     z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
     x, d = fit.x + z[:, :n_x], fit.d + z[:, n_x:]

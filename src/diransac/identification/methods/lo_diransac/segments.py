@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 DIVERGED = 1e50
 """Error after a divergence, and state from which on squares of its derivatives overflow, whatever their units."""
 _STATE_STEPS = 15
-_OUTLYING = 6.0
-"""Robust standard deviations from which on a sample is far from the smoothed motion."""
+OUTLYING = 6.0
+"""Robust standard deviations from which on a sample is far from a motion."""
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
         True where nothing is measured.
     """
     apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
-    return np.asarray(~(np.abs(apart) > _OUTLYING * lower_scale(apart.copy(), intervals.known)))
+    return np.asarray(~(np.abs(apart) > OUTLYING * lower_scale(apart.copy(), intervals.known)))
 
 
 def prior_states(

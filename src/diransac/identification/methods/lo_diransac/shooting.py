@@ -265,7 +265,7 @@ class ShootingIntervals:
         if not later.any():
             return weights
         rows = self._rows_later(later)
-        return np.where(rows >= 0, np.take_along_axis(weights, rows, axis=0), 0.0)
+        return np.where((rows >= 0) & other.known, np.take_along_axis(weights, rows, axis=0), 0.0)
 
     def _rows_later(self, whole: FloatArray) -> IntArray:
         """Row ``(N, n_s)`` of the same log by a number of samples later, for each signal; -1 where there is none."""
