@@ -168,11 +168,11 @@ class Arbiter:
     motion : Motion
         From which states start that nothing measures.
     inlying : (N, n_signals) bool array
-        Samples that are no outliers.
+        Samples that count before a prediction.
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
     lost : (K, n_after, n_s) bool array, optional
-        Samples whose losses do not count; None before candidates are compared.
+        Predicted samples that do not count; None before candidates are compared.
     """
 
     segments: Segments
@@ -227,43 +227,26 @@ class Arbiter:
         return [-(-n // self._after.step) for n in self.steps]
 
     @cached_property
-    def _sampled(self) -> BoolArray:
-        """Mask ``(K, n_rows, n_s)`` of the samples of the segments that are no outliers."""
-        one = self.segments
-        return (one.intervals.sampled & self.inlying)[one.rows][:, :, one.columns]
-
-    @cached_property
     def _known(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the samples to predict."""
-        return np.asarray(self._sampled[:, self._after] & _predicted(self.segments))
-
-    @cached_property
-    def _counted(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the samples whose losses count."""
-        return self._known if self.lost is None else self._known & ~self.lost
-
-    @cached_property
-    def _measured(self) -> FloatArray:
-        """Samples ``(K, n_rows, n_s)`` of the segments; NaN for outliers."""
+        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
         one = self.segments
-        return np.where(self._sampled, one.intervals.measured[:, one.columns][one.rows], np.nan)
+        sampled = one.intervals.sampled[one.rows[:, self._after]][:, :, one.columns] & _predicted(one)
+        return np.asarray(sampled if self.lost is None else sampled & ~self.lost)
 
     @cached_property
-    def _spread(self) -> FloatArray:
-        """Spread ``(n_s,)`` of the samples that count."""
-        y = np.where(self._counted, self._measured[:, self._after], np.nan)
+    def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
+        """Spread ``(n_s,)`` of what counts, and RMS errors of the prediction that nothing changes, by horizon."""
+        one, few = self.segments, max(1, min(3, self.n_before))
+        before, after = one.rows[:, self.n_before - few : self.n_before], one.rows[:, self._after]
+        measured, seen = one.intervals.measured, one.intervals.sampled & self.inlying
+        last = np.where(seen, measured, np.nan)[before][:, :, one.columns]
+        y = np.where(self._known, measured[after][:, :, one.columns], np.nan)
         flat = y.reshape(-1, y.shape[2])
         spread = _root_mean_squares(flat - _medians(flat))
-        return np.where(spread > 0.0, spread, 1.0)
-
-    @cached_property
-    def _no_change(self) -> list[FloatArray]:
-        """RMS errors ``(n_s,)`` of the prediction that nothing changes, by horizon."""
-        n, few = self.n_before, max(1, min(3, self.n_before))
-        last = np.stack([_medians(x) for x in self._measured[:, n - few : n]])[:, None]
-        apart = np.where(self._known, self._measured[:, self._after] - last, np.nan)
-        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, apart.shape[2])) for n in self._n_rows]
-        return [np.where(size > 0.0, size, self._spread) for size in sizes]
+        spread = np.where(spread > 0.0, spread, 1.0)
+        apart = y - np.stack([_medians(x) for x in last])[:, None]
+        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, y.shape[2])) for n in self._n_rows]
+        return spread, [np.where(size > 0.0, size, spread) for size in sizes]
 
     def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
         """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
@@ -286,10 +269,10 @@ class Arbiter:
         for good, one in zip(medians <= _GOOD * np.fmin.reduce(medians), errors, strict=True):
             own = good[self.block]
             nearest[own] = np.minimum(nearest[own], np.abs(one[own]))
-        columns = (-1, len(self._spread))
+        columns = (-1, len(self._sizes[0]))
         left = lower_scale(nearest.reshape(columns), self._known.reshape(columns))
         least, fair, n_lost = OUTLYING * np.nan_to_num(left, nan=np.inf), self, 0
-        while (lost := self._known & (nearest > np.maximum(fair._spread, least))).sum() > n_lost:
+        while (lost := self._known & (nearest > np.maximum(fair._sizes[0], least))).sum() > n_lost:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
@@ -302,30 +285,23 @@ class Arbiter:
 
     def _scores(self, errors: FloatArray) -> Scores:
         """Scores of errors ``(K, n_after, n_s)``."""
-        mse = self._mean_squares(errors, self._counted) / np.square(self._spread)
-        by_horizon = _means(np.log1p(np.minimum(mse, _LOST)))
+        spread, no_change = self._sizes
+        losses, found = list[FloatArray](), list[FloatArray]()
+        squares = np.where(self._known, np.square(errors), 0.0)
+        for n, size in zip(self._n_rows, no_change, strict=True):
+            count = self._known[:, :n].sum(axis=1)
+            mse = np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan)
+            losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
+            found.append(_medians(mse / np.square(size)))
+        by_horizon = _means(np.array(losses))
         of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
-        found = [_medians(x) for x in self._relative(errors)]
         return Scores(np.sqrt(_means(np.array(found))), of_blocks)
 
     def _block_medians(self, errors: FloatArray) -> FloatArray:
-        """Geometric means over the horizons of the median errors ``(n_blocks,)`` in each block."""
-        relative = self._relative(errors)
-        blocks = [relative[:, self.block == k] for k in range(self.left_out.shape[1])]
-        medians = np.array([[_means(_medians(x)) for x in one] for one in blocks])
-        return np.exp(0.5 * _means(np.log(medians + _TINY)))
-
-    def _relative(self, errors: FloatArray) -> FloatArray:
-        """Mean squares ``(n_horizons, K, n_s)`` of errors over those of the prediction that nothing changes."""
-        return self._mean_squares(errors, self._known) / np.square(np.array(self._no_change)[:, None])
-
-    def _mean_squares(self, errors: FloatArray, known: BoolArray) -> FloatArray:
-        """Mean squares ``(n_horizons, K, n_s)`` of errors of the samples that are known; NaN where none is."""
-        squares, found = np.where(known, np.square(errors), 0.0), list[FloatArray]()
-        for n in self._n_rows:
-            count = known[:, :n].sum(axis=1)
-            found.append(np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan))
-        return np.array(found)
+        """Geometric means over the signals of the median errors ``(n_blocks,)`` in each block; NaN without a sample."""
+        sizes = np.where(self._known, np.abs(errors), np.nan)
+        blocks = [sizes[self.block == k].reshape(-1, sizes.shape[2]) for k in range(self.left_out.shape[1])]
+        return np.exp(_means(np.log(np.array([_medians(x) for x in blocks]) + _TINY)))
 
     def _errors(self, candidate: Candidate) -> FloatArray:
         """Errors ``(K, n_after, n_s)`` of the predicted rows."""

@@ -313,7 +313,7 @@ class Contest:
     def _judged(self, search: Searched | None) -> _Judgement | None:
         """Comparison of all candidates; None where the logs are too short for one, or nothing takes part.
 
-        Outliers and noise are those of the search.
+        Outliers before a prediction, and the noise, are those of the search.
         """
         if not self.entries:
             return None
