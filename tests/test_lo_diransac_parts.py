@@ -591,6 +591,9 @@ def test_weights_follow_their_samples_where_a_delay_passes_half_a_sample():
     np.testing.assert_array_equal(np.delete(found, 2, axis=1), np.delete(weights, 2, axis=1))
     assert found[:, 2].tolist() == [*range(2, 201), 0]
     assert late.weights_in(punctual, found)[:, 2].tolist() == [0, *range(2, 201)]
+    with_gap = punctual.weights_in(replace(late, gaps=np.arange(200) == 60), weights)[:, 2]
+    assert np.flatnonzero(with_gap == 0.0).tolist() == [*range(60, 75), 199]
+    assert with_gap[[59, 75]].tolist() == [61, 77]
 
 
 # ---------------------------------------------------------------------- screening

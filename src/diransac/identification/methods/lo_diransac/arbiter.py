@@ -219,7 +219,7 @@ class Arbiter:
     @cached_property
     def _after(self) -> slice:
         """Rows of a segment that are predicted and compared."""
-        return slice(self.n_before, None, -(-self.steps[-1] * len(self.segments) // _MOST_ROWS))
+        return slice(self.n_before, None, max(1, -(-self.steps[-1] * len(self.segments) // _MOST_ROWS)))
 
     @cached_property
     def _n_rows(self) -> list[int]:
