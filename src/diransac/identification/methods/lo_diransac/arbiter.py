@@ -37,7 +37,7 @@ _FEWEST_ROWS, _PART = 4, 3
 """Rows of the shortest horizon, and stretches over segments at least."""
 _LOST, _TINY = 1e4, 1e-300
 _GOOD = 10.0
-"""Factor of the least median error in a block up to which a candidate is good there."""
+"""Factor of the least error in a block up to which a candidate is good there."""
 _MOST_ROWS = 100_000
 """Rows that are compared, at most: the errors of all candidates are in memory together."""
 _AS_WELL = 0.02
@@ -168,7 +168,7 @@ class Arbiter:
     motion : Motion
         From which states start that nothing measures.
     inlying : (N, n_signals) bool array
-        Samples that count before a prediction.
+        Samples that a fit takes for no outliers; they count before a prediction.
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
     lost : (K, n_after, n_s) bool array, optional
@@ -251,9 +251,9 @@ class Arbiter:
     def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
         """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
 
-        Such a sample is an outlier, or a state that outliers hide led all simulations astray.  The good candidates of a
-        block are those whose median error there is at most ten times the least.  All of them miss a lost sample by more
-        than the spread of its signal, and by six times what they leave of the others.
+        The good candidates of a block are those whose robust errors there are at most ten times the least.  A sample
+        is lost if all of them miss it by six times what they leave of the others, and if the fit takes it for an
+        outlier, or the spread of its signal is less: a fit that is wrong may take anything for an outlier or a motion.
 
         Parameters
         ----------
@@ -264,15 +264,15 @@ class Arbiter:
         Arbiter, list of Scores
         """
         errors = [self._errors(x) for x in candidates]
-        medians = np.array([self._block_medians(x) for x in errors])
+        scales = np.array([self._block_scales(x) for x in errors])
         nearest = np.full(self._known.shape, np.inf)
-        for good, one in zip(medians <= _GOOD * np.fmin.reduce(medians), errors, strict=True):
+        for good, e in zip(scales <= _GOOD * np.fmin.reduce(scales), errors, strict=True):
             own = good[self.block]
-            nearest[own] = np.minimum(nearest[own], np.abs(one[own]))
-        columns = (-1, len(self._sizes[0]))
-        left = lower_scale(nearest.reshape(columns), self._known.reshape(columns))
-        least, fair, n_lost = OUTLYING * np.nan_to_num(left, nan=np.inf), self, 0
-        while (lost := self._known & (nearest > np.maximum(fair._sizes[0], least))).sum() > n_lost:
+            nearest[own] = np.minimum(nearest[own], np.abs(e[own]))
+        far = self._known & (nearest > OUTLYING * np.nan_to_num(_scale(nearest, self._known), nan=np.inf))
+        outlying = ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
+        fair, n_lost = self, 0
+        while (lost := far & (outlying | (nearest > fair._sizes[0]))).sum() > n_lost:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
@@ -297,11 +297,10 @@ class Arbiter:
         of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
         return Scores(np.sqrt(_means(np.array(found))), of_blocks)
 
-    def _block_medians(self, errors: FloatArray) -> FloatArray:
-        """Geometric means over the signals of the median errors ``(n_blocks,)`` in each block; NaN without a sample."""
-        sizes = np.where(self._known, np.abs(errors), np.nan)
-        blocks = [sizes[self.block == k].reshape(-1, sizes.shape[2]) for k in range(self.left_out.shape[1])]
-        return np.exp(_means(np.log(np.array([_medians(x) for x in blocks]) + _TINY)))
+    def _block_scales(self, errors: FloatArray) -> FloatArray:
+        """Geometric means over the signals of robust scales ``(n_blocks,)`` of errors in each block; NaN if unknown."""
+        blocks = [self.block == k for k in range(self.left_out.shape[1])]
+        return np.exp(_means(np.log(np.array([_scale(errors[x], self._known[x]) for x in blocks]) + _TINY)))
 
     def _errors(self, candidate: Candidate) -> FloatArray:
         """Errors ``(K, n_after, n_s)`` of the predicted rows."""
@@ -315,6 +314,12 @@ class Arbiter:
         return np.array(segments.errors(lanes, states)[0][:, self._after])
 
 
+def _scale(errors: FloatArray, known: BoolArray) -> FloatArray:
+    """Robust scale ``(n_s,)`` of errors ``(K, n, n_s)``; NaN of signals of which few samples are known."""
+    columns = (-1, errors.shape[2])
+    return lower_scale(errors.reshape(columns), known.reshape(columns))
+
+
 def _means(values: FloatArray) -> FloatArray:
     """Means of the finite numbers along the last axis; NaN where there are none."""
     known = np.isfinite(values)
@@ -324,8 +329,6 @@ def _means(values: FloatArray) -> FloatArray:
 
 def _medians(values: FloatArray) -> FloatArray:
     """Medians ``(n,)`` of the finite numbers of each column; NaN where there are none."""
-    if not len(values):
-        return np.full(values.shape[1], np.nan)
     known = np.isfinite(values)
     ordered, count = np.sort(np.where(known, values, np.nan), axis=0), known.sum(axis=0)
     middle = (ordered[np.maximum(k, 0), np.arange(len(count))] for k in ((count - 1) // 2, count // 2))
