@@ -35,7 +35,8 @@ from real import DATA, RECORDS, Record, logs_of, scores_of
 from regime_flights import REGIMES, recordings
 
 import diransac as dr
-from diransac.identification.methods.lo_diransac.arbiter import Comparison
+from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
+from diransac.identification.methods.lo_diransac.sources import Candidate
 from diransac.study import trial_data
 from simulated import MACHINES, as_log, flight
 
@@ -78,6 +79,12 @@ def _alone(scores: Sequence[Any]) -> Any:
     return replace(found, weights=np.where(np.arange(len(found.weights)) == found.best, 1.0, 0.0))
 
 
+def _with_outliers_of_the_fit(arbiter: Arbiter, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
+    """Scores of all samples but those that a fit takes for outliers."""
+    fair = replace(arbiter, lost=arbiter.outliers_of_fit)
+    return fair, [fair.scores(x) for x in candidates]
+
+
 def _parts() -> dict[str, Part]:
     off = {"input_delay": False, "input_lag": False, "max_recording_errors": 0}
     return {
@@ -100,7 +107,7 @@ def _parts() -> dict[str, Part]:
         "simulation error": _without_source("simulation error"),
         "second fit": Part(patches=(("competition.Contest.is_challenged", lambda *_: False),)),
         "competition": Part(replace(DEFAULT, sources=())),
-        "samples that nobody predicts do not count": Part(patches=(("arbiter._GOOD", 1e-300),)),
+        "outliers by predictions": Part(patches=(("arbiter.Arbiter.compared", _with_outliers_of_the_fit),)),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
         "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
         "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),

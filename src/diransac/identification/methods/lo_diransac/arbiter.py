@@ -234,6 +234,11 @@ class Arbiter:
         return np.asarray(sampled if self.lost is None else sampled & ~self.lost)
 
     @cached_property
+    def outliers_of_fit(self) -> BoolArray:
+        """Mask ``(K, n_after, n_s)`` of the predicted samples that a fit takes for outliers."""
+        return ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
+
+    @cached_property
     def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
         """Spread ``(n_s,)`` of what counts, and RMS errors of the prediction that nothing changes, by horizon."""
         one, few = self.segments, max(1, min(3, self.n_before))
@@ -270,9 +275,8 @@ class Arbiter:
             own = good[self.block]
             nearest[own] = np.minimum(nearest[own], np.abs(e[own]))
         far = self._known & (nearest > OUTLYING * np.nan_to_num(_scale(nearest, self._known), nan=np.inf))
-        outlying = ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
         fair, n_lost = self, 0
-        while (lost := far & (outlying | (nearest > fair._sizes[0]))).sum() > n_lost:
+        while (lost := far & (self.outliers_of_fit | (nearest > fair._sizes[0]))).sum() > n_lost:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
