@@ -111,12 +111,17 @@ def test_interval_is_never_narrower_than_that_of_the_complete_model():
 
 # ---------------------------------------------------------------------- a cart in its logs
 
+
+def cart_equations(q, v, a, u, p):
+    return [p.mass * a.x + p.damping * v.x - u.force]
+
+
 CART = dr.Model(
     "cart",
     coordinates={"x": "m"},
     inputs={"force": "N"},
     parameters={"mass": dr.Parameter("kg", positive=True), "damping": dr.Parameter("N s/m")},
-    equations=lambda q, v, a, u, p: [p.mass * a.x + p.damping * v.x - u.force],
+    equations=cart_equations,
 )
 
 
@@ -144,8 +149,8 @@ def cart_log(seed, *, drag=0.0, mean=3.0, swing=1.0, noise=0.003, n=1500, dt=0.0
 TRUTH = {"mass": 2.0, "damping": 0.5}
 
 
-def identified(log):
-    return dr.identify(CART, log, differentiate=True)
+def identified(log, model=CART):
+    return dr.identify(model, log, differentiate=True)
 
 
 def covers(intervals):
@@ -221,6 +226,44 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     )
     covariance = full.covariance
     assert tests.regression.effects[:, k] == pytest.approx(covariance[:2, 2] / covariance[2, 2], rel=0.1)
+
+
+def products_of(regression):
+    """Squares and products of all columns and residuals."""
+    rows = np.concatenate([regression.columns, regression.residuals[:, :, None]], axis=2)
+    rows = rows.reshape(-1, rows.shape[2])
+    return rows.T @ rows
+
+
+def test_long_logs_are_tested_in_sections_with_the_same_answer(monkeypatch):
+    """Residuals are gathered, so that the same squares and products take less memory; forces are those of intervals."""
+    from diransac.identification.methods.lo_diransac import missing_terms, term_regression
+
+    whole, found = missing_terms.term_regression, []
+
+    def both(intervals, fit, result, accelerations, *more):
+        together = whole(intervals, fit, result, accelerations, *more)
+        found.append(together)
+        numbers = len(intervals) * term_regression._numbers(fit, accelerations.shape[2])
+        for n_sections in (2, 7):
+            with monkeypatch.context() as small:
+                small.setattr(term_regression, "_MOST", numbers / n_sections)
+                found.append(whole(intervals, fit, result, accelerations, *more))
+        return together
+
+    monkeypatch.setattr(missing_terms, "term_regression", both)
+    logs = [cart_log(3, mean=1.0, swing=1.0), cart_log(4, mean=1.0, n=700)]
+    parameters = {**CART.parameters, "mass": dr.Parameter("kg", per_log=True)}
+    identified(logs, dr.Model("carts", CART.coordinates, CART.inputs, parameters, cart_equations))
+    together, *others = found[:3]
+    for cut in others:
+        assert cut.columns.size < 0.5 * together.columns.size
+        expected, products = products_of(together), products_of(cut)
+        size = np.sqrt(np.diag(expected))
+        assert np.allclose(products / np.outer(size, size), expected / np.outer(size, size), atol=1e-9)
+        for name in ("effects", "direct", "force", "forces"):
+            own, other = getattr(together, name), getattr(cut, name)
+            assert np.allclose(other, own, rtol=1e-6, atol=1e-9 * np.abs(own).max())
 
 
 def test_terms_that_the_model_has_are_no_candidates(monkeypatch):

@@ -7,6 +7,7 @@ left to right (``N s/m`` is ``(N s)/m``) into a factor and powers of the SI base
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Mapping
@@ -103,6 +104,7 @@ def same_unit(a: str, b: str) -> bool:
     return factor is not None and math.isclose(factor, 1.0, rel_tol=1e-9)
 
 
+@functools.lru_cache(maxsize=4096)
 def conversion(a: str, b: str) -> float | None:
     """Factor from unit ``a`` to unit ``b``; None for units of different dimensions and for unknown units.
 

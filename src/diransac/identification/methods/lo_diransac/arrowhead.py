@@ -11,13 +11,18 @@ inverse cost O(W).  Windows are eliminated by compiled code, for the border as f
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.simulation.compiler import solve_blocks
+
+if TYPE_CHECKING:
+    from diransac.simulation.compiler import BlockSolution
 
 # Below what rounding leaves of a diagonal of one; keeps what no measurement shows (a heading that nothing depends on).
 _RIDGE = 1e-13
@@ -129,24 +134,82 @@ class Arrowhead:
         found = self._solved(of_z, of_p, 0.0)
         return found.step_z, found.step_p
 
+    def functional_in_sections(
+        self, of_z: Callable[[slice], FloatArray], of_p: FloatArray, sections: Sequence[slice]
+    ) -> tuple[list[FloatArray], FloatArray]:
+        """Inverse times columns, as `functional`, of which no more than a section's are needed at a time.
+
+        A section is solved with what the windows before it leave of its first one when they are eliminated, and with
+        the solution of the window after it.
+
+        Parameters
+        ----------
+        of_z : callable
+            ``(n, k, c)`` columns of consecutive windows.
+        of_p : (m, c) array
+        sections : sequence of slice
+            In their order, all windows together.
+
+        Returns
+        -------
+        list of (n, k, c) array
+            Of each section.
+        (m, c) array
+        """
+        m, shift = len(self.corner), self.ridge * _size(np.einsum("wii->wi", self.diagonal))
+
+        def solved(part: slice, before: Sequence[FloatArray] = (), after: FloatArray | None = None) -> BlockSolution:
+            diagonal, columns = self.diagonal[part], np.concatenate([self.border[part], of_z(part)], axis=2)
+            if before:
+                diagonal = np.concatenate([[diagonal[0] - before[0]], diagonal[1:]])
+                columns[0] -= before[1]
+            if after is not None:
+                columns[-1] -= self.below[part.stop - 1].T @ after
+            return solve_blocks(diagonal, self.below[part.start : part.stop - 1], (columns,), shift[part])
+
+        left: list[Sequence[FloatArray]] = [()]
+        for part in sections[:-1]:
+            found, link = solved(part, left[-1]), self.below[part.stop - 1]
+            left.append((link @ found.inverse[-1] @ link.T, link @ found.solved[-1]))
+        windows, after = list[FloatArray](), None
+        for part, before in zip(reversed(sections), reversed(left), strict=True):
+            windows.append(solved(part, before, after).solved)
+            after = windows[-1][0]
+        windows.reverse()
+        flat = [(x.reshape(-1, x.shape[2]), self.border[part]) for x, part in zip(windows, sections, strict=True)]
+        common = np.sum([border.reshape(-1, m).T @ x for x, border in flat], axis=0)
+        p, _, _ = _solve_shared(self.corner, common, of_p, self.ridge)
+        for i, x in enumerate(windows):
+            windows[i] = x[:, :, m:] - (x[:, :, :m].reshape(-1, m) @ p).reshape(*x.shape[:2], -1)
+        return windows, p
+
     def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
         """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides."""
         W, k, m = self.border.shape
-        more = damping + self.ridge
-        border, own = np.ascontiguousarray(self.border), np.diag(self.corner)
+        more, border = damping + self.ridge, np.ascontiguousarray(self.border)
         shift = more * _size(np.einsum("wii->wi", self.diagonal))
         solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (border, right_z), shift)
         flat = solved.reshape(W * k, -1)
-        common = border.reshape(W * k, m).T @ flat
-        # Metres and radians per second squared differ by decades: shared unknowns are scaled to a diagonal of one.
-        scale = 1.0 / np.sqrt(_size(own))
-        scales = np.outer(scale, scale)
-        left = (self.corner - common[:, :m]) * scales + more * np.eye(m)
-        var_p = _inverse(left) * scales
-        p = var_p @ (right_p - common[:, m:])
+        p, var_p, of_shared = _solve_shared(self.corner, border.reshape(W * k, m).T @ flat, right_p, more)
         z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(W, k, -1)
-        log_det += float(np.linalg.slogdet(left)[1] - 2.0 * np.log(scale).sum())
-        return Factored(z, p, inverse, below, var_p, solved[:, :, :m], log_det)
+        return Factored(z, p, inverse, below, var_p, solved[:, :, :m], log_det + of_shared)
+
+
+def _solve_shared(
+    corner: FloatArray, common: FloatArray, right_p: FloatArray, ridge: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Solution (m, c) of the shared unknowns, their inverse (m, m), and the logarithm of its inverse's determinant.
+
+    ``common (m, m + c)`` is what the eliminated windows take from the corner and its right-hand sides.
+    """
+    m = len(corner)
+    # Metres and radians per second squared differ by decades: shared unknowns are scaled to a diagonal of one.
+    scale = 1.0 / np.sqrt(_size(np.diag(corner)))
+    scales = np.outer(scale, scale)
+    left = (corner - common[:, :m]) * scales + ridge * np.eye(m)
+    var_p = _inverse(left) * scales
+    log_det = float(np.linalg.slogdet(left)[1] - 2.0 * np.log(scale).sum())
+    return var_p @ (right_p - common[:, m:]), var_p, log_det
 
 
 def _size(diagonal: FloatArray) -> FloatArray:

@@ -32,19 +32,9 @@ from diransac.identification.methods.lo_diransac.motion_equations import (
     residuals_of_motion,
     slopes_of_delays,
 )
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    innovations,
-    linearize,
-    of_logs,
-    split,
-    sum_of_products,
-    weights_of,
-)
-from diransac.identification.methods.lo_diransac.term_evidence import (
-    CandidateTests,
-    TermRegression,
-    probabilities,
-)
+from diransac.identification.methods.lo_diransac.normal_equations import split
+from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, TermRegression, probabilities
+from diransac.identification.methods.lo_diransac.term_regression import parts_of_intervals, term_regression
 from diransac.identification.methods.lo_diransac.unmeasured import measured_signals, unmeasured_states
 from diransac.identification.structure.candidate_terms import RelativeMotion, TermLibrary, candidate_terms
 from diransac.identification.structure.lacking_terms import PossibleTerm, name_of_term, with_terms
@@ -68,13 +58,9 @@ _EQUIVALENT = 1e-6
 _DRAWS, _PER_PARAMETER, _SEED = 200, 4, 0
 # Relative residual up to which a regressor is linear; component of a unit vector that is rounding.
 _RANK = 1e-7
-# Factor of the prior of discrepancies that holds them at zero.
-_HELD = 1e-3
-# Part of the information of an interval, and of the largest force, that is rounding.
+# Part of the largest force that is rounding.
 _ROUNDING = 1e-12
 _HUGE, _TINY = 1e9, 1e-300
-# Numbers of a regression on all terms at most (80 MB, a tenth of a second).
-_MOST = 1e7
 
 
 @dataclass(frozen=True)
@@ -100,6 +86,8 @@ class Candidates:
 
     def without(self, left_out: Sequence[int]) -> Candidates:
         """All but some of the terms."""
+        if not left_out:
+            return self
         kept = np.delete(np.arange(len(self.library)), left_out).tolist()
         return Candidates(
             replace(self.library, terms=tuple(self.library.terms[k] for k in kept)),
@@ -157,16 +145,16 @@ def candidates_of_fit(
     motion, r, W, M = residuals_of_motion(intervals, fit, p)
     drawn, largest = _drawn(intervals, motion), _largest_forces(intervals, fit, motion, r, W, M)
     candidates = _library(intervals, motion, drawn, library)
-    finer, fit = split(intervals, fit, _parts(intervals, fit, len(candidates)))
+    finer, fit = split(intervals, fit, parts_of_intervals(intervals, fit, len(candidates)))
     means = candidates.means(motion, _weights_of_rows(finer), finer.length)
     means = np.where(finer.occupied[:, None, None], means, 0.0)
     relative = (np.sqrt(np.square(means).sum(axis=0) / finer.occupied.sum()) / (largest[:, None] + _TINY)).max(axis=0)
     acting = np.isfinite(relative) & (relative > _ROUNDING)
     chosen = np.flatnonzero(acting & ~_replaceable(drawn, candidates))
-    effects = np.concatenate([means[:, :, chosen], _means(finer, slopes_of_delays(intervals, motion, p))], axis=2)
-    inertia, acts = _mean_inertia(intervals, M), (effects != 0.0).any(axis=0)
-    accelerations = -np.linalg.solve(_mean_inertia(finer, M), effects)
-    regression = _regression(finer, fit, result, accelerations, inertia, acts, _inertia_slopes(intervals, drawn))
+    means = np.concatenate([means[:, :, chosen], _means(finer, slopes_of_delays(intervals, motion, p))], axis=2)
+    inertia, acts = _mean_inertia(intervals, M), (means != 0.0).any(axis=0)
+    accelerations = np.asarray(-np.linalg.solve(_mean_inertia(finer, M), means))
+    regression = term_regression(finer, fit, result, accelerations, inertia, acts, _inertia_slopes(intervals, drawn))
     found = Candidates(
         replace(candidates, terms=tuple(candidates.terms[k] for k in chosen)),
         1.0 / relative[chosen],
@@ -296,88 +284,6 @@ def _inertia_slopes(intervals: ShootingIntervals, drawn: _DrawnMotion) -> FloatA
     for one in places:
         found[one] += slopes / len(places)
     return found
-
-
-# ---------------------------------------------------------------------- what each term changes in a fit
-
-
-def _parts(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> int:
-    """Parts of each interval over which terms are constant: samples, if the regression then fits into the memory.
-
-    Terms change with each reversal, within intervals over which the unmodelled acceleration is constant: a mean would
-    count a friction that reverses as one that is small.
-    """
-    k = fit.x.shape[1] + fit.d.shape[1]
-    n = k + len(fit.shared)
-    numbers = len(intervals) * (n_terms * (n + 2 * k) + n**2)
-    return max(
-        x for x in range(1, intervals.length + 1) if intervals.length % x == 0 and (x == 1 or x * numbers < _MOST)
-    )
-
-
-def _regression(
-    intervals: ShootingIntervals,
-    fit: Fit,
-    result: ProjectedEstimate,
-    accelerations: FloatArray,
-    inertia: FloatArray,
-    acts: BoolArray,
-    slopes: FloatArray,
-) -> TermRegression:
-    """The regression on effects that accelerate the model, constantly over each interval: (W, n_v, K) per unit.
-
-    The estimate is that of a fit whose intervals, with this mean inertia, were split.
-    """
-    prior = fit.prior.copy()
-    prior[intervals.n_p :] *= _HELD
-    at, n_x = linearize(intervals, replace(fit, prior=prior), weights_of(intervals, fit)), fit.x.shape[1]
-    sums, k = intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights), n_x + fit.d.shape[1]
-    by_d, precision = sums.normal_matrix[:, :, n_x:k], at.precision[:, :, None]
-    pushed = by_d[:, :k] @ accelerations
-    jumps = -at.slopes[:, :, n_x:k] @ accelerations[:-1]
-    direct = (accelerations * pushed[:, n_x:k]).sum(axis=(0, 1)) + (precision * np.square(jumps)).sum(axis=(0, 1))
-    of_z, of_s = at.by_jumps(intervals, jumps)
-    of_z, of_s = of_z + pushed, of_s + sum_of_products(intervals, by_d[:, k:], accelerations)
-    # The last column is the step of all else: what an unfinished fit, or one without discrepancies, gives up.
-    z, s = at.system.functional(
-        np.concatenate([-of_z, at.right_z[:, :, None]], axis=2), np.concatenate([-of_s, at.right_s[:, None]], axis=1)
-    )
-    # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
-    parts, d = (x.reshape(len(inertia), -1, *x.shape[1:]) for x in (z, fit.d))
-    whole = np.concatenate([parts[:, 0, :n_x], parts[:, :, n_x:].mean(axis=1)], axis=1)
-    effects = np.einsum("wkp,wke->pe", result.of_z, whole[:, :, :-1], optimize=True) + result.of_s.T @ s[:, :-1]
-    forces = inertia @ whole[:, n_x:]
-    force = (inertia @ d.mean(axis=1)[:, :, None])[:, :, 0] + forces[:, :, -1]
-    moved, of_log = z.copy(), of_logs(intervals, s)
-    moved[:, n_x:, :-1] += accelerations
-    n_measured = intervals.known.reshape(len(intervals), -1).sum(axis=1).max()
-    root, residuals = _whitened(sums.normal_matrix, sums.gradient, n_measured)
-    measured = np.concatenate([root[:, :, :k] @ moved + root[:, :, k:] @ of_log, residuals[:, :, None]], axis=2)
-    jumps = z[1:, :n_x] - at.slopes[:, :, :k] @ moved[:-1] - at.slopes[:, :, k:] @ of_log[:-1]
-    ahead = np.concatenate([jumps, at.jumps[:, :, None]], axis=2) * np.sqrt(precision)
-    driven = innovations(intervals, fit, np.concatenate([np.moveaxis(z[:, n_x:k], 2, 0), fit.d[None]]))
-    rows = np.concatenate([measured, np.pad(ahead, ((0, 1), (0, 0), (0, 0))), np.moveaxis(driven, 0, 2)], axis=1)
-    rows = rows.reshape(len(inertia), -1, rows.shape[2])
-    beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
-    more = np.pad(beforehand, ((0, -len(beforehand) % rows.shape[1]), (0, 0)))
-    rows = np.concatenate([rows, more.reshape(-1, *rows.shape[1:])])
-    left, columns = rows[:, :, -1] + rows[:, :, -2], rows[:, :, :-2]
-    return TermRegression(effects, direct, left, columns, force, forces[:, :, :-1], acts, slopes)
-
-
-def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """Slopes (W, m, n) of whitened measurements by the unknowns of each interval, and residuals (W, m).
-
-    As many rows as there are unknowns, or measurements, ``most``, say all of the measurements: a square root of their
-    information H (W, n, n), and residuals that have their gradient.
-    """
-    size = np.sqrt(np.einsum("wii->wi", H))
-    size[size == 0.0] = 1.0
-    values, vectors = (x[..., -most:] for x in np.linalg.eigh(H / (size[:, :, None] * size[:, None, :])))
-    known = values > _ROUNDING * values[:, -1:]
-    root = np.sqrt(np.where(known, values, 0.0))
-    slopes = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2))
-    return slopes, np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
 
 
 # ---------------------------------------------------------------------- forces, and terms that parameters equal

@@ -313,21 +313,24 @@ def _places(intervals: ShootingIntervals) -> IntArray:
     return np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
 
 
-def of_logs(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+def of_logs(intervals: ShootingIntervals, values: FloatArray, part: slice = slice(None)) -> FloatArray:
     """Values of the shared unknowns of each interval's own log.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     values : (n_s, ...) array
+    part : slice, optional
+        Intervals; all where none are given.
 
     Returns
     -------
     (W, n_own, ...) array
     """
+    logs = intervals.log_of[part]
     if intervals.layout.is_shared:
-        return np.broadcast_to(values, (len(intervals), *values.shape))
-    return np.asarray(values[_places(intervals)[intervals.log_of]])
+        return np.broadcast_to(values, (len(logs), *values.shape))
+    return np.asarray(values[_places(intervals)[logs]])
 
 
 def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
@@ -339,7 +342,9 @@ def _in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     return wide
 
 
-def sum_of_products(intervals: ShootingIntervals, a: FloatArray, b: FloatArray) -> FloatArray:
+def sum_of_products(
+    intervals: ShootingIntervals, a: FloatArray, b: FloatArray, part: slice = slice(None)
+) -> FloatArray:
     """Sums ``(n_s, ...)`` over intervals of ``a @ b``, in the places of their logs.
 
     Parameters
@@ -348,10 +353,12 @@ def sum_of_products(intervals: ShootingIntervals, a: FloatArray, b: FloatArray) 
     a : (n, n_own, m) array
         Of the shared unknowns of the first intervals' own logs.
     b : (n, m, ...) array
+    part : slice, optional
+        Intervals, of which those are the first.
     """
     if intervals.layout.is_shared:
         return np.asarray(np.tensordot(a, b, ([0, 2], [0, 1])))
-    found, logs = np.zeros((intervals.n_shared, *b.shape[2:])), intervals.log_of[: len(a)]
+    found, logs = np.zeros((intervals.n_shared, *b.shape[2:])), intervals.log_of[part][: len(a)]
     for i, at in enumerate(_places(intervals)):
         found[at] += np.tensordot(a[logs == i], b[logs == i], ([0, 2], [0, 1]))
     return found

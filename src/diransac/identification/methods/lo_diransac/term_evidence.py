@@ -221,13 +221,13 @@ class CandidateTests:
 
     def sets(self) -> list[TermSet]:
         """Each term alone, then pairs that are clearly more probable than either of their terms, and than by chance."""
-        alone, (pairs, white) = self.alone(), self._pairs()
+        alone, (pairs, white), margin = self.alone(), self._pairs(), self.least
         log_odds = np.array([x.log_odds for x in alone])
-        least = log_odds[pairs].max(axis=1, initial=self.least - _EVIDENCE) + self.least
+        least = log_odds[pairs].max(axis=1, initial=margin - _EVIDENCE) + margin
         # What neighbouring intervals have in common leaves the largest part of its odds to the pair that explains most.
         found, part, most = list[TermSet](), 1.0, -np.inf
         for i in np.argsort(-white, kind="stable"):
-            if part * white[i] <= max(least[i], most - self.least):
+            if part * white[i] <= max(least[i], most - margin):
                 continue
             one = self._pair(pairs[i])
             part = part if np.isfinite(most) else max(one.log_odds / white[i], 0.0)
@@ -254,8 +254,8 @@ class CandidateTests:
     def _pairs(self) -> tuple[IntArray, FloatArray]:
         """Pairs ``(P, 2)`` of different effects that the log determines, and their log odds if residuals are white."""
         odds, prior = self._prior
-        columns, over = self.regression.columns, ([0, 1], [0, 1])
-        gram, values = (np.tensordot(columns, x, over) for x in (columns, -self.regression.residuals))
+        columns = self.regression.columns.reshape(self.regression.residuals.size, len(self.terms))
+        gram, values = (columns.T @ x for x in (columns, -self.regression.residuals.ravel()))
         a, b = np.triu_indices(len(self.terms), 1)
         effects = np.unique([x.parameter for x in self.terms], return_inverse=True)[1]
         own, separate = np.diag(gram), gram[a, a] - np.square(gram[a, b]) / (gram[b, b] + _TINY)

@@ -1,0 +1,239 @@
+"""The regression of a fit's residuals on candidate terms, with all else that is estimated beside them.
+
+A term accelerates the model, as the unmodelled accelerations do, so that its slopes are in the normal equations.  One
+solution of these for all terms gives the residuals' slopes by the coefficients.  Long logs are cut into sections, and
+residuals of neighbouring intervals are gathered, so that memory is bounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    innovation_std,
+    linearize,
+    of_logs,
+    sum_of_products,
+    weights_of,
+)
+from diransac.identification.methods.lo_diransac.term_evidence import TermRegression
+
+if TYPE_CHECKING:
+    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
+    from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
+    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.simulation import GaussNewtonBatch
+
+# Numbers of a section's equations, and of all gathered residuals, at most (80 MB, a tenth of a second).
+_MOST = 1e7
+# Factor of the prior of discrepancies that holds them at zero.
+_HELD = 1e-3
+# Part of the information of an interval that is rounding.
+_ROUNDING = 1e-12
+
+
+def parts_of_intervals(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> int:
+    """Parts of each interval over which terms are constant: samples, if the regression then fits into the memory.
+
+    Terms change with each reversal, within intervals over which the unmodelled acceleration is constant: a mean would
+    count a friction that reverses as one that is small.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    n_terms : int
+    """
+    most = _MOST / (len(intervals) * _numbers(fit, n_terms))
+    return max(x for x in range(1, intervals.length + 1) if intervals.length % x == 0 and (x == 1 or x < most))
+
+
+def term_regression(
+    intervals: ShootingIntervals,
+    fit: Fit,
+    result: ProjectedEstimate,
+    accelerations: FloatArray,
+    inertia: FloatArray,
+    acts: BoolArray,
+    slopes: FloatArray,
+) -> TermRegression:
+    """The regression on effects that accelerate the model.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    result : ProjectedEstimate
+        Of a fit whose intervals were split.
+    accelerations : (W, n_v, K) array
+        Of each term per unit of its coefficient, constant over each interval.
+    inertia : (W_e, n_v, n_v) array
+        Means of the intervals of the estimate.
+    acts, slopes : array
+        As in `TermRegression`.
+
+    Returns
+    -------
+    TermRegression
+    """
+    prior = fit.prior.copy()
+    prior[intervals.n_p :] *= _HELD
+    fit = replace(fit, prior=prior)
+    at, parts, n_x = (
+        linearize(intervals, fit, weights_of(intervals, fit)),
+        len(intervals) // len(inertia),
+        fit.x.shape[1],
+    )
+    pushed = _Pushed(intervals, fit, accelerations, at, intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights))
+    length = parts * max(int(_MOST / (parts * _numbers(fit, accelerations.shape[2]))), 1)
+    sections = [slice(k, min(k + length, len(intervals))) for k in range(0, len(intervals), length)]
+    direct, of_s = (np.sum(x, axis=0) for x in zip(*map(pushed.of_shared, sections), strict=True))
+    solved, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
+    rows = [_gathered(pushed.residuals(k, sections, solved, s), parts, len(sections)) for k in range(len(sections))]
+    for i, z in enumerate(solved):
+        # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
+        z = z.reshape(-1, parts, *z.shape[1:])
+        solved[i] = np.concatenate([z[:, 0, :n_x], z[:, :, n_x:].mean(axis=1)], axis=1)
+    z = np.concatenate(solved)
+    effects = np.einsum("wkp,wke->pe", result.of_z, z[:, :, :-1], optimize=True) + result.of_s.T @ s[:, :-1]
+    forces, d = inertia @ z[:, n_x:], fit.d.reshape(len(inertia), parts, -1).mean(axis=1)
+    force = (inertia @ d[:, :, None])[:, :, 0] + forces[:, :, -1]
+    beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
+    more = np.pad(beforehand, ((0, -len(beforehand) % rows[0].shape[1]), (0, 0)))
+    rows.append(more.reshape(-1, *rows[0].shape[1:]))
+    together: FloatArray = np.empty((sum(map(len, rows)), *rows[0].shape[1:]))
+    for end in np.cumsum([len(x) for x in rows]).tolist():
+        own = rows.pop(0)  # of a long log they fill the memory
+        together[end - len(own) : end] = own
+    left, columns = together[:, :, -1] + together[:, :, -2], together[:, :, :-2]
+    return TermRegression(effects, direct, left, columns, force, forces[:, :, :-1], acts, slopes)
+
+
+@dataclass(frozen=True)
+class _Pushed:
+    """A fit and its normal equations, all and those of the measurements, with accelerations (W, n_v, K) of K terms."""
+
+    intervals: ShootingIntervals
+    fit: Fit
+    accelerations: FloatArray
+    at: NormalEquations
+    sums: GaussNewtonBatch
+
+    @property
+    def by_d(self) -> FloatArray:
+        """Columns ``(W, n, n_v)`` of the unmodelled accelerations in the information of the measurements."""
+        return self.sums.normal_matrix[:, :, self.fit.x.shape[1] : self.at.right_z.shape[1]]
+
+    def jumps(self, links: slice) -> tuple[FloatArray, FloatArray]:
+        """Change ``(n, n_x, K)`` of the jumps at the ends of some intervals, and that times their precision."""
+        n_x, k = self.fit.x.shape[1], self.at.right_z.shape[1]
+        jumps = -self.at.slopes[links, :, n_x:k] @ self.accelerations[:-1][links]
+        return jumps, self.at.precision[links, :, None] * jumps
+
+    def of_shared(self, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Of some intervals: information (K,) of each coefficient, if all else were known, and (n_s, K) as below."""
+        n_x, k, links = (
+            self.fit.x.shape[1],
+            self.at.right_z.shape[1],
+            slice(part.start, min(part.stop, len(self.at.jumps))),
+        )
+        own, by_d, (jumps, force) = self.accelerations[part], self.by_d[part], self.jumps(links)
+        direct = (own * (by_d[:, n_x:k] @ own)).sum(axis=(0, 1)) + (jumps * force).sum(axis=(0, 1))
+        of_jumps = sum_of_products(self.intervals, self.at.slopes[links, :, k:].swapaxes(1, 2), force, part)
+        return direct, of_jumps - sum_of_products(self.intervals, by_d[:, k:], own, part)
+
+    def of_windows(self, part: slice) -> FloatArray:
+        """Right-hand sides ``(n, k, K + 1)``: what takes up each term, and the step of all else.
+
+        The step is what an unfinished fit, or one without discrepancies, gives up.
+        """
+        n_x, k, first = self.fit.x.shape[1], self.at.right_z.shape[1], max(part.start - 1, 0)
+        links = slice(first, min(part.stop, len(self.at.jumps)))
+        found = np.empty((part.stop - part.start, k, self.accelerations.shape[2] + 1))
+        found[:, :, :-1] = -self.by_d[part, :k] @ self.accelerations[part]
+        found[:, :, -1] = self.at.right_z[part]
+        _, force = self.jumps(links)
+        own = force[part.start - first :]
+        found[: len(own), :, :-1] += self.at.slopes[part.start : links.stop, :, :k].swapaxes(1, 2) @ own
+        reached = force[: part.stop - 1 - first]
+        found[first + 1 - part.start :][: len(reached), :n_x, :-1] -= reached
+        return found
+
+    def residuals(self, i: int, sections: Sequence[slice], solved: Sequence[FloatArray], s: FloatArray) -> FloatArray:
+        """Whitened residuals of a section: slopes by each coefficient, the change by the step, and what the fit leaves.
+
+        Of the measurements, of continuity, and of the unmodelled accelerations from their prior.
+
+        Parameters
+        ----------
+        i : int
+            Of the section.
+        sections : sequence of slice
+        solved, s : sequence of (n, k, K + 1) array, and (n_s, K + 1) array
+            Solutions of each section, and of the shared unknowns.
+
+        Returns
+        -------
+        (n, m, K + 2) array
+        """
+        at, intervals, fit, part, z = self.at, self.intervals, self.fit, sections[i], solved[i]
+        n_x, k, K = fit.x.shape[1], z.shape[1], s.shape[1]
+        moved, of_log = z.copy(), of_logs(intervals, s, part)
+        moved[:, n_x:, :-1] += self.accelerations[part]
+        n_measured = intervals.known.reshape(len(intervals), -1).sum(axis=1).max()
+        root, residuals = _whitened(self.sums.normal_matrix[part], self.sums.gradient[part], n_measured)
+        found: FloatArray = np.zeros((len(z), root.shape[1] + k, K + 1))
+        measured, ahead, driven = np.split(found, [root.shape[1], root.shape[1] + n_x], axis=1)
+        np.matmul(root[:, :, :k], moved, out=measured[:, :, :K])
+        measured[:, :, :K] += root[:, :, k:] @ of_log
+        measured[:, :, K] = residuals
+        following = np.concatenate([z[1:], *(x[:1] for x in solved[i + 1 : i + 2])])
+        n, links = len(following), slice(part.start, part.start + len(following))
+        slopes = at.slopes[links]
+        ahead[:n, :, :K] = following[:, :n_x] - slopes[:, :, :k] @ moved[:n] - slopes[:, :, k:] @ of_log[:n]
+        ahead[:n, :, K] = at.jumps[links]
+        ahead[:n] *= np.sqrt(at.precision[links])[:, :, None]
+        rho = np.where(intervals.following[part, None], fit.rho, 0.0)[:, :, None]
+        before = np.concatenate([solved[max(i - 1, 0)][-1:], z[:-1]]), np.concatenate([fit.d[:1], fit.d[:-1]])[part]
+        driven[:, :, :K] = z[:, n_x:] - rho * before[0][:, n_x:]
+        driven[:, :, K] = fit.d[part] - rho[:, :, 0] * before[1]
+        driven /= innovation_std(intervals, fit)[part, :, None]
+        return found
+
+
+def _numbers(fit: Fit, n_terms: int) -> float:
+    """Numbers that an interval takes in the regression on terms."""
+    k = fit.x.shape[1] + fit.d.shape[1]
+    n = k + len(fit.shared)
+    return float(n_terms * (n + 2 * k) + n**2)
+
+
+def _gathered(rows: FloatArray, parts: int, n_sections: int) -> FloatArray:
+    """Residuals of intervals of so many parts; of one of several sections as few of groups, with the same products."""
+    rows = rows.reshape(len(rows) // parts, -1, rows.shape[2])
+    if n_sections == 1:
+        return rows
+    length = -(-len(rows) // max(int(_MOST / rows.shape[2] ** 2) // n_sections, 1))
+    groups = (rows[k : k + length].reshape(-1, rows.shape[2]) for k in range(0, len(rows), length))
+    triangles = [np.linalg.qr(x, mode="r") for x in groups]
+    return np.stack([np.pad(x, ((0, rows.shape[2] - len(x)), (0, 0))) for x in triangles])
+
+
+def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """Slopes (W, m, n) of whitened measurements by the unknowns of each interval, and residuals (W, m).
+
+    As many rows as there are unknowns, or measurements, ``most``, say all of the measurements: a square root of their
+    information H (W, n, n), and residuals that have their gradient.
+    """
+    size = np.sqrt(np.einsum("wii->wi", H))
+    size[size == 0.0] = 1.0
+    values, vectors = (x[..., -most:] for x in np.linalg.eigh(H / (size[:, :, None] * size[:, None, :])))
+    known = values > _ROUNDING * values[:, -1:]
+    root = np.sqrt(np.where(known, values, 0.0))
+    slopes = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2))
+    return slopes, np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
