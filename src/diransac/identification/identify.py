@@ -389,8 +389,11 @@ def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
         return [], 0
     from diransac.identification.regression.nonlinear import solved_nonlinear
 
-    with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-        return mistakes_of_columns(dataset, solved_nonlinear)
+    def found() -> tuple[list[Mistake], int]:
+        with np.errstate(all="ignore"):  # a correction that overflows explains nothing
+            return mistakes_of_columns(dataset, solved_nonlinear)
+
+    return dataset.kept("mistakes of columns", found)
 
 
 def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:
