@@ -30,6 +30,7 @@ from diransac.identification.methods.lo_diransac.projection import (
 from diransac.identification.methods.lo_diransac.search import (
     Decided,
     Searched,
+    equivalents_of,
     likeliest,
     searched,
     with_equivalents,
@@ -293,7 +294,17 @@ class Contest:
         of_logs = self._of_logs(judged, result.parameters)
         outcome = Decided(self._summary(judged), None if of_fit else winner.acting, of_logs)
         impossible = search.impossible if of_fit else ()
-        return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
+        as_likely = self._equivalents(judged, result.parameters)
+        return replace(
+            search, motion=self.motion, result=result, decided=outcome, impossible=impossible, as_likely=as_likely
+        )
+
+    def _equivalents(self, judged: _Judgement, parameters: FloatArray) -> tuple[FloatArray, ...]:
+        """Parameters with the response of the answer that predict, too: unmodelled forces do not tell them apart."""
+        one, others = self.candidates[judged.comparison.best], equivalents_of(self.dataset, self.intervals, parameters)
+        arbiter, n = judged.arbiter, self.blocks.n
+        same = (replace(one, parameters=p, without=np.repeat(p[None], n, axis=0)) for p in others)
+        return tuple(x.parameters for x in same if predicts(arbiter.scores(x).errors))
 
     def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""

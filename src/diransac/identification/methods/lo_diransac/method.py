@@ -274,9 +274,10 @@ def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding
         pairs = zip(layout.names, other.tolist(), is_close(other, found.result.parameters), strict=True)
         changed = {n: x for n, x, close in pairs if not close}
         values = ", ".join(f"{n} = {x:.4g}" for n, x in changed.items())
+        verb = "explain" if found.decided is None else "may explain"
         yield Finding(
             "bad",
-            f"Since nothing measures {names}, {values} explain this log as well",
+            f"Since nothing measures {names}, {values} {verb} this log as well",
             f"bound {' or '.join(changed)}, or measure {names}",
         )
 

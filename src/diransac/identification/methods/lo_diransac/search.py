@@ -197,24 +197,28 @@ def likeliest(
     return best
 
 
+def equivalents_of(dataset: Dataset, intervals: ShootingIntervals, parameters: FloatArray) -> list[FloatArray]:
+    """Other admissible parameters that have the transfer function of given ones.
+
+    Where all states are measured, equations of motion determine the parameters, and there are none.
+    """
+    model, layout, signals = dataset.model, dataset.layout, measured_signals(intervals)
+    if not unmeasured_states(intervals) or not layout.is_shared or structural(model, signals, dataset.ranges):
+        return []
+    found = equivalent_parameters(model, parameters, signals, dataset.ranges)
+    return [p for p in found if layout.admits(p[None])[0]]
+
+
 def with_equivalents(
     settings: LoDiransacSettings, dataset: Dataset, found: Searched, seed: int, callback: Callback | None
 ) -> Searched:
-    """The likeliest of a search and of further ones, from parameters that have the transfer function of its estimate.
-
-    Where all states are measured, equations of motion determine the parameters, and there is no further one.
-    """
-    intervals, model, layout = found.likeliest.intervals, dataset.model, dataset.layout
-    signals = measured_signals(intervals)
-    if not unmeasured_states(intervals) or not layout.is_shared or structural(model, signals, dataset.ranges):
-        return found
-    every = [found]
+    """The likeliest of a search and of further ones, from parameters with the transfer function of its estimate."""
+    intervals, every = found.likeliest.intervals, [found]
     try:
-        for p in equivalent_parameters(model, found.result.parameters, signals, dataset.ranges):
-            if layout.admits(p[None])[0]:
-                begin, further = with_simulated_states(intervals, found.motion, p), within(callback, 0.895, 0.9)
-                with suppress(IdentificationError, np.linalg.LinAlgError):
-                    every.append(searched(settings, intervals, begin, found.notes, seed, dataset, further, p[None]))
+        for p in equivalents_of(dataset, intervals, found.result.parameters):
+            begin, further = with_simulated_states(intervals, found.motion, p), within(callback, 0.895, 0.9)
+            with suppress(IdentificationError, np.linalg.LinAlgError):
+                every.append(searched(settings, intervals, begin, found.notes, seed, dataset, further, p[None]))
     except TimeLimitError:
         return replace(found, likeliest=replace(found.likeliest, complete=False))
     best = min(every, key=lambda x: x.likeliest.cost)
