@@ -20,6 +20,7 @@ from diransac.study import connected, load, paths, status, trials
 from diransac.study import data as data_module
 from diransac.study.data import derived_seed
 from diransac.study.specification import Missions
+from diransac.study.store import Store
 from studies import TINY, TINY_TOML, command, rows, tiny
 
 PLANT = load(TINY).plant.plant
@@ -476,6 +477,19 @@ def test_ctrl_c_ends_a_run_at_once_and_says_how_to_go_on(tmp_path: Path):
     assert counts == f"{kept} of 8000 rows are kept in a.db; the same command runs the rest"
     assert end == "interrupted"
     assert all(re.match(r"tiny: \d+ of 8000 rows, 0% after \d+ s", line) for line in progress)
+
+
+def test_rows_are_counted_that_were_kept_as_ctrl_c_came(tmp_path: Path, monkeypatch):
+    add, counts = Store.add, []
+
+    def interrupted(store: Store, new: list) -> int:
+        add(store, new)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Store, "add", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, progress=lambda done, _asked: counts.append(done))
+    assert counts[-1] == len(rows(tmp_path / "a.db")) > 0
 
 
 # On a cluster ---------------------------------------------------------------------------------------------------------

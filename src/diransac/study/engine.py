@@ -133,6 +133,9 @@ class _Run:
                 timeout = left if math.isfinite(left) else None
                 for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
                     self._keep(*self._running.pop(future), future)
+        except KeyboardInterrupt:
+            self._note(self._store.finished())  # it may have come between keeping rows and counting them
+            raise
         finally:
             for future in self._running:
                 future.cancel()
