@@ -110,7 +110,7 @@ def _parts() -> dict[str, Part]:
         "outliers by predictions": Part(patches=(("arbiter.Arbiter.compared", _with_outliers_of_the_fit),)),
         "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
         "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
-        "second-order correction of steps": Part(patches=(("refinement._CORRECTED", 0.0),)),
+        "second-order correction of steps": Part(patches=(("gauss_newton._CORRECTED", 0.0),)),
         "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),
     }
 

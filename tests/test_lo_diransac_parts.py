@@ -8,7 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
-from diransac.identification.methods.lo_diransac import integration_steps, refinement
+from diransac.identification.methods.lo_diransac import gauss_newton, integration_steps
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
@@ -444,9 +444,9 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
     def failing(there, trial, weights):
         return cost(there, trial, weights) if trial is fit or not next(failures, False) else before + 1.0
 
-    monkeypatch.setattr(refinement, "_CORRECTED", 0.0)
-    monkeypatch.setattr(refinement, "cost", failing)
-    step = refinement.gauss_newton_step(intervals, fit, at, begin)
+    monkeypatch.setattr(gauss_newton, "_CORRECTED", 0.0)
+    monkeypatch.setattr(gauss_newton, "cost", failing)
+    step = gauss_newton.gauss_newton_step(intervals, fit, at, begin)
     assert cost(step.intervals, step.fit, weights) < before
     np.testing.assert_allclose([step.damped, step.damping], [damped, following])
     np.testing.assert_array_equal(step.solved.var_p, at.step(at.right).of_fit.var_p)

@@ -15,9 +15,10 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
+from diransac.identification.methods.lo_diransac.gauss_newton import bounded, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.refinement import bounded, diverges, linearized, negative_log_evidence
+from diransac.identification.methods.lo_diransac.refinement import diverges, negative_log_evidence
 from diransac.identification.tracking.surprise import followed, free_motion
 from diransac.identification.tracking.window import AS_LIKELY, Linearization
 

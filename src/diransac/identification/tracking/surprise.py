@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.normal_equations import weights_of
-from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored

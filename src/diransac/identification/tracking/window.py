@@ -10,9 +10,9 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
+from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
-from diransac.identification.methods.lo_diransac.refinement import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.scales import (
     SHRINK,
     ProcessSums,

@@ -11,12 +11,12 @@
 | `shooting.py` | logs as intervals, each a rollout of the augmented model |
 | `mixture.py` | noise: a Gaussian and outliers |
 | `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
-| `refinement.py` | local optimisation, from easy to exact |
+| `refinement.py`, `gauss_newton.py` | local optimisation, from easy to exact, and its steps |
 | `local_search.py` | explanations of a log, of which the likeliest is chosen |
 | `recording_errors.py` | delays and biases of sensors, delays of inputs, gains that drift |
 | `projection.py` | parameters and covariance |
 | `checks.py` | findings of a fit on itself |
-| `missing_terms.py`, `term_evidence.py` | terms that the model may lack: tests at the fit, suggestions, weights |
+| `missing_terms.py`, `term_regression.py`, `term_evidence.py` | terms that the model may lack, and their weights |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diransac.identification.methods.lo_diransac.gauss_newton import after_step
 from diransac.identification.methods.lo_diransac.normal_equations import (
     data_gradient,
     linearize,
     weights_of,
     with_residuals,
 )
-from diransac.identification.methods.lo_diransac.refinement import after_step
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.arrowhead import Factored
