@@ -4,6 +4,7 @@ Logs are made by LSODA, SciPy's `odeint`, from equations that are written here o
 """
 
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -381,12 +382,27 @@ def test_observers_find_a_joint_from_anywhere():
     assert best[:5] == pytest.approx(list(JOINT.values()), rel=0.03)
 
 
-def test_observers_of_long_logs_have_fewer_starts():
+def test_observers_of_long_logs_start_from_their_liveliest_stretch(monkeypatch):
+    """Parameters come from there, and states are those of the beginning of the log."""
+    problem, _, _ = observers_of_joint(10.0)
+    n = len(problem.samples)
+    monkeypatch.setattr("diransac.identification.regression.observers._ENOUGH", n // 2)
+    found = problem.best_starts(60, 5)
+    assert found[0, :5] == pytest.approx(list(JOINT.values()), rel=0.05)
+    np.testing.assert_array_equal(found[:, 5:], np.tile(problem.begin, (5, 1)))
+    still = np.where(np.abs(np.arange(n) - 0.6 * n) < 0.1 * n, problem.inputs[:, 0], problem.inputs[0, 0])
+    quiet = replace(problem, driving=np.zeros_like(problem.driving), inputs=still[:, None])
+    (rows,) = quiet._liveliest(0.25)
+    assert rows.stop - rows.start == round(0.25 * n)
+    assert rows.start <= 0.5 * n + 1
+    assert rows.stop >= 0.7 * n - 1
+
+
+def test_larger_problems_have_fewer_starts():
     problem, _, _ = observers_of_joint(8.0)
-    given = (problem.inputs, problem.readings, problem.weights, problem.begin, problem.rows_of_logs, problem.dt)
-    longer = observers(problem.model, problem.layout, ("motor",), np.zeros((100_000, 1)), *given, 8.0)
     assert len(problem.starts()) == 256
-    assert 16 <= len(longer.starts()) < 64
+    many = replace(problem, rows_of_logs=60 * problem.rows_of_logs)
+    assert 16 <= len(many.starts()) < 64
 
 
 def test_a_hidden_motion_beside_forces_that_the_model_lacks_is_not_relied_on():

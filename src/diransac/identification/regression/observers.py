@@ -22,7 +22,7 @@ parameter estimation" (a coupling to the data that is lowered gradually).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import casadi as ca
@@ -30,6 +30,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.data.dataset import ParameterLayout
+from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.nonlinear import ParameterChart
 from diransac.model import Model, Parameter
 from diransac.model.derivation import Symbols
@@ -37,6 +38,8 @@ from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
 _N_STARTS = 256
 """Starts at most."""
+# Rows of all logs that are enough to find starts; numbers of all rows and pairs of unknowns of all starts at most.
+_ENOUGH, _NUMBERS = 2000, 200_000_000
 _TURN = 2.0 * np.pi
 
 
@@ -154,8 +157,6 @@ class ObserverFit:
         Integration steps per sample.
     parameters : (n_p,) array, optional
         Known parameters.
-    n_starts : int, optional
-        Number of starts.
     """
 
     model: Model
@@ -174,7 +175,6 @@ class ObserverFit:
     bandwidth: float
     substeps: int
     parameters: FloatArray | None = None
-    n_starts: int = _N_STARTS
 
     @cached_property
     def _simulator(self) -> Simulator:
@@ -194,11 +194,35 @@ class ObserverFit:
 
     def starts(self) -> FloatArray:
         """Unknowns (n_starts, n) to start from: parameters over the bounds or six decades, with one set of states."""
-        states = self.begin.reshape(1, -1)
         if self.parameters is not None:
-            return states
-        chart = ParameterChart(self.layout.bounds)
-        return np.hstack([chart.to_parameters(chart.starts(self.n_starts)), np.tile(states, (self.n_starts, 1))])
+            return self.begin.reshape(1, -1)
+        # Fewer starts of larger problems.
+        n_rows, n_unknowns = sum(x.stop - x.start for x in self.rows_of_logs), len(self.layout) + self.begin.size
+        chart, n = ParameterChart(self.layout.bounds), _NUMBERS // (n_rows * n_unknowns**2)
+        return self._begun(chart.to_parameters(chart.starts(int(np.clip(n, 16, _N_STARTS)))))
+
+    def _begun(self, z: FloatArray) -> FloatArray:
+        """Unknowns with the parameters of others, and the states to start from."""
+        return np.hstack([z[:, : self._n_parameters], np.tile(self.begin.reshape(1, -1), (len(z), 1))])
+
+    def best_starts(self, n_steps: int, n_kept: int) -> FloatArray:
+        """Unknowns ``(n_kept, n)`` after steps from all starts, the best first; over a stretch of each long log."""
+        n_rows = sum(x.stop - x.start for x in self.rows_of_logs)
+        some = self if n_rows <= _ENOUGH else replace(self, rows_of_logs=self._liveliest(_ENOUGH / n_rows))
+        z, cost = least_squares(some, some.starts(), n_steps)
+        z = z[np.argsort(cost, kind="stable")[:n_kept]]
+        return z if some is self else self._begun(z)
+
+    def _liveliest(self, part: float) -> list[slice]:
+        """A part of the rows of each log, in which what drives the observer changes most."""
+        found, size = [], self._inputs.std(axis=0)
+        changes = np.square((self._inputs[1:] - self._inputs[:-1]) / np.where(size > 0.0, size, 1.0)).sum(axis=1)
+        for rows in self.rows_of_logs:
+            n = max(round(part * (rows.stop - rows.start)), 1)
+            total = np.concatenate([[0.0], np.cumsum(changes[rows.start : rows.stop - 1])])
+            first = rows.start + int(np.argmax(total[n - 1 :] - total[: len(total) - n + 1]))
+            found.append(slice(first, first + n))
+        return found
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""
@@ -316,13 +340,11 @@ def observers(
     begin : (n_logs, n_x) array
         States from which the search starts at the beginning of each log.
     """
-    observer, n = _whole_model(model, sampled), len(layout) + begin.size
+    observer = _whole_model(model, sampled)
     compared = tuple(observer.state[model.state.index(name)] for name in sampled)
-    # Fewer starts of larger problems: numbers of all rows and pairs of unknowns of all starts are bounded.
-    n_starts = int(np.clip(200_000_000 // (len(samples) * n**2), 16, _N_STARTS))
     shown = (inputs, readings, weights, rows_of_logs, dt, bandwidth, substeps)
     of_all = (model, layout, observer, model.state, compared, samples, samples, begin)
-    return ObserverFit(*of_all, *shown, n_starts=n_starts)
+    return ObserverFit(*of_all, *shown)
 
 
 @lru_cache(maxsize=64)

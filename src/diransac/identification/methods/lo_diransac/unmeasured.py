@@ -136,8 +136,7 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     from diransac.identification.regression.multistart import least_squares
 
     problem = _driven(intervals, motion)
-    z, cost = least_squares(problem, problem.starts(), _N_STEPS)
-    z, cost = least_squares(problem, z[np.argsort(cost, kind="stable")[:_N_FINALISTS]], _N_FURTHER_STEPS)
+    z, cost = least_squares(problem, problem.best_starts(_N_STEPS, _N_FINALISTS), _N_FURTHER_STEPS)
     return _best(intervals, motion, problem, z[np.isfinite(cost)])
 
 
@@ -176,9 +175,10 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     """
     from diransac.identification.regression.multistart import least_squares
 
-    problem = _observers(intervals, motion)
-    z = problem.starts()
-    for width, n_steps, n_kept in _STAGES:
+    (width, n_steps, n_kept), *stages = _STAGES
+    problem = replace(_observers(intervals, motion), bandwidth=width / intervals.duration)
+    z = problem.best_starts(n_steps, n_kept)
+    for width, n_steps, n_kept in stages:
         problem = replace(problem, bandwidth=width / intervals.duration)
         z, cost = least_squares(problem, z, n_steps)
         best = np.argsort(cost, kind="stable")[:n_kept]
