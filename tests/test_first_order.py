@@ -387,7 +387,7 @@ def test_observers_of_long_logs_start_from_their_liveliest_stretch(monkeypatch):
     problem, _, _ = observers_of_joint(10.0)
     n = len(problem.samples)
     monkeypatch.setattr("diransac.identification.regression.observers._ENOUGH", n // 2)
-    found = problem.best_starts(60, 5)
+    found = problem.best_starts([(60, 5)])
     assert found[0, :5] == pytest.approx(list(JOINT.values()), rel=0.05)
     np.testing.assert_array_equal(found[:, 5:], np.tile(problem.begin, (5, 1)))
     still = np.where(np.abs(np.arange(n) - 0.6 * n) < 0.1 * n, problem.inputs[:, 0], problem.inputs[0, 0])

@@ -205,12 +205,20 @@ class ObserverFit:
         """Unknowns with the parameters of others, and the states to start from."""
         return np.hstack([z[:, : self._n_parameters], np.tile(self.begin.reshape(1, -1), (len(z), 1))])
 
-    def best_starts(self, n_steps: int, n_kept: int) -> FloatArray:
-        """Unknowns ``(n_kept, n)`` after steps from all starts, the best first; over a stretch of each long log."""
+    def best_starts(self, steps: Sequence[tuple[int, int]]) -> FloatArray:
+        """Unknowns ``(k, n)`` after steps from all starts, the best first; over a stretch of each long log.
+
+        Parameters
+        ----------
+        steps : sequence of (int, int)
+            Numbers of steps, and of those that go on from there.
+        """
         n_rows = sum(x.stop - x.start for x in self.rows_of_logs)
         some = self if n_rows <= _ENOUGH else replace(self, rows_of_logs=self._liveliest(_ENOUGH / n_rows))
-        z, cost = least_squares(some, some.starts(), n_steps)
-        z = z[np.argsort(cost, kind="stable")[:n_kept]]
+        z = some.starts()
+        for n_steps, n_kept in steps:
+            z, cost = least_squares(some, z, n_steps)
+            z = z[np.argsort(cost, kind="stable")[:n_kept]]
         return z if some is self else self._begun(z)
 
     def _liveliest(self, part: float) -> list[slice]:

@@ -23,12 +23,13 @@ if TYPE_CHECKING:
     from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 
-# Steps from all starts; the number of those that go on, and their further steps.
-_N_STEPS, _N_FINALISTS, _N_FURTHER_STEPS = 15, 12, 60
+# Steps from all starts, and from the best ones, with the number that goes on; further steps.
+_N_FINALISTS, _N_FURTHER_STEPS = 12, 15
+_STEPS = ((15, _N_FINALISTS), (60, _N_FINALISTS))
 # Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out.
 _MEMORY = 4.0
 # Bandwidths of observers that follow samples, over that of an interval; steps with each, and the number that goes on.
-_STAGES = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, 12))
+_STAGES = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, _N_FINALISTS))
 # Samples further than so many standard deviations from the smoothed motion are outliers.
 _OUTLYING = 5.0
 _TINY = 1e-9
@@ -136,7 +137,7 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     from diransac.identification.regression.multistart import least_squares
 
     problem = _driven(intervals, motion)
-    z, cost = least_squares(problem, problem.best_starts(_N_STEPS, _N_FINALISTS), _N_FURTHER_STEPS)
+    z, cost = least_squares(problem, problem.best_starts(_STEPS), _N_FURTHER_STEPS)
     return _best(intervals, motion, problem, z[np.isfinite(cost)])
 
 
@@ -175,9 +176,9 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     """
     from diransac.identification.regression.multistart import least_squares
 
-    (width, n_steps, n_kept), *stages = _STAGES
+    (width, *first), *stages = _STAGES
     problem = replace(_observers(intervals, motion), bandwidth=width / intervals.duration)
-    z = problem.best_starts(n_steps, n_kept)
+    z = problem.best_starts([(first[0], first[1])])
     for width, n_steps, n_kept in stages:
         problem = replace(problem, bandwidth=width / intervals.duration)
         z, cost = least_squares(problem, z, n_steps)
