@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation import GaussNewtonBatch
 
-# Numbers of a section's equations, and of all gathered residuals, at most (80 MB, a tenth of a second).
+# Numbers of equations that are solved at once, and of all gathered residuals, at most (80 MB, a tenth of a second).
 _MOST = 1e7
 # Factor of the prior of discrepancies that holds them at zero.
 _HELD = 1e-3
@@ -84,34 +84,31 @@ def term_regression(
     prior = fit.prior.copy()
     prior[intervals.n_p :] *= _HELD
     fit = replace(fit, prior=prior)
-    at, parts, n_x = (
-        linearize(intervals, fit, weights_of(intervals, fit)),
-        len(intervals) // len(inertia),
-        fit.x.shape[1],
-    )
+    at, n_x = linearize(intervals, fit, weights_of(intervals, fit)), fit.x.shape[1]
+    parts = len(intervals) // len(inertia)
     pushed = _Pushed(intervals, fit, accelerations, at, intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights))
-    length = parts * max(int(_MOST / (parts * _numbers(fit, accelerations.shape[2]))), 1)
-    sections = [slice(k, min(k + length, len(intervals))) for k in range(0, len(intervals), length)]
+    sections = _sections(len(intervals), parts, _numbers(fit, accelerations.shape[2]))
     direct, of_s = (np.sum(x, axis=0) for x in zip(*map(pushed.of_shared, sections), strict=True))
     solved, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
     rows = [_gathered(pushed.residuals(k, sections, solved, s), parts, len(sections)) for k in range(len(sections))]
-    for i, z in enumerate(solved):
+    effects, forces = result.of_s.T @ s[:, :-1], list[FloatArray]()
+    for part, z in zip(sections, solved, strict=True):
         # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
-        z = z.reshape(-1, parts, *z.shape[1:])
-        solved[i] = np.concatenate([z[:, 0, :n_x], z[:, :, n_x:].mean(axis=1)], axis=1)
-    z = np.concatenate(solved)
-    effects = np.einsum("wkp,wke->pe", result.of_z, z[:, :, :-1], optimize=True) + result.of_s.T @ s[:, :-1]
-    forces, d = inertia @ z[:, n_x:], fit.d.reshape(len(inertia), parts, -1).mean(axis=1)
-    force = (inertia @ d[:, :, None])[:, :, 0] + forces[:, :, -1]
+        own, z = slice(part.start // parts, part.stop // parts), z.reshape(-1, parts, *z.shape[1:])
+        z = np.concatenate([z[:, 0, :n_x], z[:, :, n_x:].mean(axis=1)], axis=1)
+        effects = effects + np.einsum("wkp,wke->pe", result.of_z[own], z[:, :, :-1], optimize=True)
+        forces.append(inertia[own] @ z[:, n_x:])
+    moved, d = np.concatenate(forces), fit.d.reshape(len(inertia), parts, -1).mean(axis=1)
+    force = (inertia @ d[:, :, None])[:, :, 0] + moved[:, :, -1]
     beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
     more = np.pad(beforehand, ((0, -len(beforehand) % rows[0].shape[1]), (0, 0)))
     rows.append(more.reshape(-1, *rows[0].shape[1:]))
     together: FloatArray = np.empty((sum(map(len, rows)), *rows[0].shape[1:]))
     for end in np.cumsum([len(x) for x in rows]).tolist():
-        own = rows.pop(0)  # of a long log they fill the memory
-        together[end - len(own) : end] = own
+        some = rows.pop(0)  # of a long log they fill the memory
+        together[end - len(some) : end] = some
     left, columns = together[:, :, -1] + together[:, :, -2], together[:, :, :-2]
-    return TermRegression(effects, direct, left, columns, force, forces[:, :, :-1], acts, slopes)
+    return TermRegression(effects, direct, left, columns, force, moved[:, :, :-1], acts, slopes)
 
 
 @dataclass(frozen=True)
@@ -204,6 +201,14 @@ class _Pushed:
         driven[:, :, K] = fit.d[part] - rho[:, :, 0] * before[1]
         driven /= innovation_std(intervals, fit)[part, :, None]
         return found
+
+
+def _sections(n_intervals: int, parts: int, numbers: float) -> list[slice]:
+    """All intervals, if their numbers are few; otherwise sections with a quarter of as many, of whole intervals."""
+    if n_intervals * numbers <= _MOST:
+        return [slice(0, n_intervals)]
+    length = parts * max(int(0.25 * _MOST / (parts * numbers)), 1)
+    return [slice(k, min(k + length, n_intervals)) for k in range(0, n_intervals, length)]
 
 
 def _numbers(fit: Fit, n_terms: int) -> float:
