@@ -20,6 +20,7 @@ from diransac.identification.assessment.inspection import inspect
 from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
+from diransac.identification.regression import observers as search
 from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.observers import observers
 from diransac.identification.structure.structural import structural
@@ -386,16 +387,31 @@ def test_observers_of_long_logs_start_from_their_liveliest_stretch(monkeypatch):
     """Parameters come from there, and states are those of the beginning of the log."""
     problem, _, _ = observers_of_joint(10.0)
     n = len(problem.samples)
-    monkeypatch.setattr("diransac.identification.regression.observers._ENOUGH", n // 2)
+    monkeypatch.setattr(search, "_ENOUGH", n // 2)
     found = problem.best_starts([(60, 5)])
     assert found[0, :5] == pytest.approx(list(JOINT.values()), rel=0.05)
     np.testing.assert_array_equal(found[:, 5:], np.tile(problem.begin, (5, 1)))
-    still = np.where(np.abs(np.arange(n) - 0.6 * n) < 0.1 * n, problem.inputs[:, 0], problem.inputs[0, 0])
-    quiet = replace(problem, driving=np.zeros_like(problem.driving), inputs=still[:, None])
-    (rows,) = quiet._liveliest(0.25)
-    assert rows.stop - rows.start == round(0.25 * n)
-    assert rows.start <= 0.5 * n + 1
-    assert rows.stop >= 0.7 * n - 1
+
+
+def test_the_liveliest_stretch_is_where_inputs_change_and_samples_count(monkeypatch):
+    problem, _, _ = observers_of_joint(10.0)
+    n, rows = len(problem.samples), np.arange(len(problem.samples))
+    monkeypatch.setattr(search, "_ENOUGH_OF_ONE", n // 8)
+    still = np.where(np.abs(rows - 0.35 * n) < 0.1 * n, problem.inputs[:, 0], problem.inputs[0, 0])
+    still[9 * n // 10 :] += 1e3
+    known = np.where(np.abs(rows - 0.9 * n)[:, None] < 3.0, 0.0, problem.weights)
+    logs = [slice(0, n // 2), slice(n // 2, n)]
+    begin = np.tile(problem.begin, (2, 1))
+    two = replace(problem, inputs=still[:, None], weights=known, rows_of_logs=logs, begin=begin)
+    stretches = two._on_stretches(0.5)
+    first, second = stretches.rows_of_logs
+    assert first.stop - first.start == second.stop - second.start == n // 4
+    assert first.start <= 0.25 * n + 1
+    assert first.stop >= 0.45 * n - 1
+    assert second.start == n // 2  # the step is where nothing was sampled
+    assert stretches.begin[0, 0] == problem.samples[first.start, 0]
+    short = two._on_stretches(0.01).rows_of_logs[1]
+    assert short.stop - short.start == n // 8  # enough of each log
 
 
 def test_larger_problems_have_fewer_starts():

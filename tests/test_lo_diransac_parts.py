@@ -113,6 +113,20 @@ def test_arrowhead_functionals_are_columns_of_the_inverse():
     assert np.allclose(np.vstack([z.reshape(-1, 2), s]), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("length", [1, 3, 7])
+def test_arrowhead_functionals_are_the_same_section_by_section(length):
+    _, blocks, _, _ = dense_arrowhead(7, 4, 3, seed=1)
+    unlinked = np.arange(6)[:, None, None] != 3
+    blocks = Arrowhead(blocks.diagonal, np.where(unlinked, blocks.below, 0.0), blocks.border, blocks.corner)
+    wanted = np.random.default_rng(2).normal(size=(7, 4, 2)), np.random.default_rng(3).normal(size=(3, 2))
+    z, s = blocks.functional(*wanted)
+    sections = [slice(k, min(k + length, 7)) for k in range(0, 7, length)]
+    parts, own = blocks.functional_in_sections(lambda part: wanted[0][part], wanted[1], sections)
+    assert [len(x) for x in parts] == [x.stop - x.start for x in sections]
+    assert np.allclose(np.concatenate(parts), z, rtol=1e-9, atol=1e-12 * np.abs(z).max())
+    assert np.allclose(own, s, rtol=1e-9, atol=1e-12 * np.abs(s).max())
+
+
 # ---------------------------------------------------------------------- noise
 
 

@@ -235,8 +235,9 @@ def products_of(regression):
     return rows.T @ rows
 
 
-def test_long_logs_are_tested_in_sections_with_the_same_answer(monkeypatch):
-    """Residuals are gathered, so that the same squares and products take less memory; forces are those of intervals."""
+@pytest.mark.parametrize(("n_sections", "n_groups"), [(8, None), (28, None), (8, 30), (36, 7)])
+def test_long_logs_are_tested_in_sections_with_the_same_answer(n_sections, n_groups, monkeypatch):
+    """Where residuals are gathered, their squares and products are the same, and errors up to their correlation."""
     from diransac.identification.methods.lo_diransac import missing_terms, term_regression
 
     whole, found = missing_terms.term_regression, []
@@ -244,26 +245,32 @@ def test_long_logs_are_tested_in_sections_with_the_same_answer(monkeypatch):
     def both(intervals, fit, result, accelerations, *more):
         together = whole(intervals, fit, result, accelerations, *more)
         found.append(together)
-        numbers = len(intervals) * term_regression._numbers(fit, accelerations.shape[2])
-        for n_sections in (2, 7):
-            with monkeypatch.context() as small:
-                small.setattr(term_regression, "_MOST", numbers / n_sections)
-                found.append(whole(intervals, fit, result, accelerations, *more))
+        n_terms = accelerations.shape[2]
+        numbers = len(intervals) * term_regression._numbers(fit, n_terms)
+        with monkeypatch.context() as small:
+            small.setattr(term_regression, "_MOST", 4.0 * numbers / n_sections)
+            if n_groups is not None:
+                small.setattr(term_regression, "_RESIDUALS", n_groups * (n_terms + 2) ** 2)
+            found.append(whole(intervals, fit, result, accelerations, *more))
         return together
 
     monkeypatch.setattr(missing_terms, "term_regression", both)
     logs = [cart_log(3, mean=1.0, swing=1.0), cart_log(4, mean=1.0, n=700)]
     parameters = {**CART.parameters, "mass": dr.Parameter("kg", per_log=True)}
     identified(logs, dr.Model("carts", CART.coordinates, CART.inputs, parameters, cart_equations))
-    together, *others = found[:3]
-    for cut in others:
-        assert cut.columns.size < 0.5 * together.columns.size
-        expected, products = products_of(together), products_of(cut)
-        size = np.sqrt(np.diag(expected))
-        assert np.allclose(products / np.outer(size, size), expected / np.outer(size, size), atol=1e-9)
-        for name in ("effects", "direct", "force", "forces"):
-            own, other = getattr(together, name), getattr(cut, name)
-            assert np.allclose(other, own, rtol=1e-6, atol=1e-9 * np.abs(own).max())
+    together, cut = found[:2]
+    assert (len(cut.residuals) < len(together.residuals)) == (n_groups is not None)
+    expected, products = products_of(together), products_of(cut)
+    size = np.sqrt(np.diag(expected))
+    assert np.allclose(products / np.outer(size, size), expected / np.outer(size, size), atol=1e-9)
+    for name in ("effects", "direct", "force", "forces"):
+        own, other = getattr(together, name), getattr(cut, name)
+        assert np.allclose(other, own, rtol=1e-6, atol=1e-9 * np.abs(own).max())
+    (estimates, variances), (others, other_variances) = (x.estimates() for x in (together, cut))
+    determined = np.isfinite(variances)
+    assert others[determined] == pytest.approx(estimates[determined], rel=1e-6)
+    ratio = other_variances[determined] / variances[determined]
+    assert ratio == pytest.approx(1.0, rel=1e-6) if n_groups is None else (0.3 < np.median(ratio) < 3.0)
 
 
 def test_terms_that_the_model_has_are_no_candidates(monkeypatch):

@@ -393,7 +393,10 @@ def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
         with np.errstate(all="ignore"):  # a correction that overflows explains nothing
             return mistakes_of_columns(dataset, solved_nonlinear)
 
-    return dataset.kept("mistakes of columns", found)
+    try:
+        return dataset.kept("mistakes of columns", found)
+    except TimeLimitError:
+        return [], 0
 
 
 def _explained(dataset: Dataset, fitted: Callable[[], Estimate]) -> Estimate:

@@ -23,7 +23,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
@@ -134,7 +134,8 @@ class _Run:
                 for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
                     self._keep(*self._running.pop(future), future)
         except KeyboardInterrupt:
-            self._note(self._store.finished())  # it may have come between keeping rows and counting them
+            with suppress(StudyError):  # it may have come between keeping rows and counting them
+                self._note(self._store.finished())
             raise
         finally:
             for future in self._running:

@@ -38,8 +38,9 @@ from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
 _N_STARTS = 256
 """Starts at most."""
-# Rows of all logs that are enough to find starts; numbers of all rows and pairs of unknowns of all starts at most.
-_ENOUGH, _NUMBERS = 2000, 200_000_000
+# Rows of all logs that are enough to find starts, and of each of many; numbers of all rows and pairs of unknowns of all
+# starts at most.
+_ENOUGH, _ENOUGH_OF_ONE, _NUMBERS = 2000, 500, 200_000_000
 _TURN = 2.0 * np.pi
 
 
@@ -214,23 +215,30 @@ class ObserverFit:
             Numbers of steps, and of those that go on from there.
         """
         n_rows = sum(x.stop - x.start for x in self.rows_of_logs)
-        some = self if n_rows <= _ENOUGH else replace(self, rows_of_logs=self._liveliest(_ENOUGH / n_rows))
+        some = self if n_rows <= _ENOUGH else self._on_stretches(_ENOUGH / n_rows)
         z = some.starts()
         for n_steps, n_kept in steps:
             z, cost = least_squares(some, z, n_steps)
             z = z[np.argsort(cost, kind="stable")[:n_kept]]
         return z if some is self else self._begun(z)
 
-    def _liveliest(self, part: float) -> list[slice]:
-        """A part of the rows of each log, in which what drives the observer changes most."""
-        found, size = [], self._inputs.std(axis=0)
-        changes = np.square((self._inputs[1:] - self._inputs[:-1]) / np.where(size > 0.0, size, 1.0)).sum(axis=1)
-        for rows in self.rows_of_logs:
-            n = max(round(part * (rows.stop - rows.start)), 1)
-            total = np.concatenate([[0.0], np.cumsum(changes[rows.start : rows.stop - 1])])
-            first = rows.start + int(np.argmax(total[n - 1 :] - total[: len(total) - n + 1]))
-            found.append(slice(first, first + n))
-        return found
+    def _on_stretches(self, part: float) -> ObserverFit:
+        """The same on a part of each log, in which its inputs change most; samples are where states start from."""
+        rows_of_logs, begin, size = [], self.begin.copy(), self.inputs.std(axis=0)
+        steps = np.square(np.diff(self.inputs, axis=0) / np.where(size > 0.0, size, 1.0)).sum(axis=1)
+        seen = np.asarray(self.weights.any(axis=1))
+        steps *= seen[1:] & seen[:-1]
+        states = [self.observer.state.index(n) for n in self.compared]
+        sampled = [(i, j) for j, i in enumerate(states) if i < len(self.found)]
+        for start, rows in zip(begin, self.rows_of_logs, strict=True):
+            length = rows.stop - rows.start
+            n = min(length, max(round(part * length), _ENOUGH_OF_ONE))
+            total = np.concatenate([[0.0], np.cumsum(steps[rows.start : rows.stop - 1])])
+            first = rows.start + int(np.argmax(total[n - 1 :] - total[: length - n + 1]))
+            rows_of_logs.append(slice(first, first + n))
+            for i, j in sampled:
+                start[i] = self.samples[first, j]
+        return replace(self, rows_of_logs=rows_of_logs, begin=begin)
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""

@@ -22,7 +22,7 @@ from diransac.arrays import FloatArray
 from diransac.data.dataset import Dataset
 from diransac.data.preprocessing import continuous, differentiate, in_units
 from diransac.data.units import conversion
-from diransac.errors import DiransacError
+from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.regression.rows import motion_rows, outside_bounds, solved
 from diransac.text_table import listed, number
 
@@ -106,6 +106,8 @@ def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mista
         other = Dataset.of(model, logs, pointwise=True)
         solve = nonlinear if model.nonlinear_parameters else solved
         return explanations(model, other.layout, motion_rows(other), dataset.given, solve)
+    except TimeLimitError:
+        raise
     except (DiransacError, np.linalg.LinAlgError):
         return [], 0  # the equations cannot be evaluated on the logs
 

@@ -176,8 +176,8 @@ class Arrowhead:
             windows.append(solved(part, before, after).solved)
             after = windows[-1][0]
         windows.reverse()
-        flat = [(x.reshape(-1, x.shape[2]), self.border[part]) for x, part in zip(windows, sections, strict=True)]
-        common = np.sum([border.reshape(-1, m).T @ x for x, border in flat], axis=0)
+        pairs = zip(sections, windows, strict=True)
+        common = np.sum([self.border[k].reshape(-1, m).T @ x.reshape(-1, x.shape[2]) for k, x in pairs], axis=0)
         p, _, _ = _solve_shared(self.corner, common, of_p, self.ridge)
         for i, x in enumerate(windows):
             windows[i] = x[:, :, m:] - (x[:, :, :m].reshape(-1, m) @ p).reshape(*x.shape[:2], -1)

@@ -8,6 +8,7 @@ fit, which may be at a local optimum, another one begins with its parameters and
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,6 +45,7 @@ from diransac.identification.methods.lo_diransac.sources import (
     jackknife,
     least_squares_candidates,
 )
+from diransac.identification.structure.equivalents import is_close
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
@@ -56,6 +58,8 @@ if TYPE_CHECKING:
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
+# Error of a prediction over that of the answer up to which it is nearly as good.
+_NEARLY = 2.0
 # Half width of an interval of 95 %, standard errors.
 _INTERVAL = 1.96
 # Samples of the intervals of a fit from an estimate at most, as far as their number has divisors.
@@ -294,17 +298,27 @@ class Contest:
         of_logs = self._of_logs(judged, result.parameters)
         outcome = Decided(self._summary(judged), None if of_fit else winner.acting, of_logs)
         impossible = search.impossible if of_fit else ()
-        as_likely = self._equivalents(judged, result.parameters)
+        as_likely = self._as_likely(search, judged, result.parameters)
         return replace(
             search, motion=self.motion, result=result, decided=outcome, impossible=impossible, as_likely=as_likely
         )
 
-    def _equivalents(self, judged: _Judgement, parameters: FloatArray) -> tuple[FloatArray, ...]:
-        """Parameters with the response of the answer that predict, too: unmodelled forces do not tell them apart."""
-        one, others = self.candidates[judged.comparison.best], equivalents_of(self.dataset, self.intervals, parameters)
-        arbiter, n = judged.arbiter, self.blocks.n
-        same = (replace(one, parameters=p, without=np.repeat(p[None], n, axis=0)) for p in others)
-        return tuple(x.parameters for x in same if predicts(arbiter.scores(x).errors))
+    def _as_likely(self, search: Searched, judged: _Judgement, parameters: FloatArray) -> tuple[FloatArray, ...]:
+        """Other parameters that a search found as likely, or with the answer's response that predict nearly as well.
+
+        What the model lacks does not tell them apart.
+        """
+        one, found = self.candidates[judged.comparison.best], list[FloatArray]()
+
+        def errors(p: FloatArray) -> FloatArray:
+            everywhere = np.repeat(p[None], self.blocks.n, axis=0)
+            return judged.arbiter.scores(replace(one, parameters=p, without=everywhere)).errors
+
+        with suppress(TimeLimitError, np.linalg.LinAlgError):  # what was decided stays
+            for p in equivalents_of(self.dataset, self.intervals, parameters):
+                if predicts(errors(p)) and (errors(p) < _NEARLY * errors(parameters)).all():
+                    found.append(p)
+        return tuple(p for p in (*found, *search.as_likely) if not is_close(p, parameters).all())
 
     def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""

@@ -404,22 +404,20 @@ def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return std
 
 
-def innovations(intervals: ShootingIntervals, fit: Fit, d: FloatArray | None = None) -> FloatArray:
+def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     """Unmodelled accelerations less those expected from the interval before, over their standard deviation.
 
     Parameters
     ----------
     intervals : ShootingIntervals
     fit : Fit
-    d : (..., W, n_v) array, optional
-        Unmodelled accelerations; those of the fit where none are given.
 
     Returns
     -------
-    (..., W, n_v) array
+    (W, n_v) array
     """
-    found = (fit.d if d is None else d).copy()
-    found[..., 1:, :] -= np.where(intervals.linked[:, None], fit.rho, 0.0) * found[..., :-1, :]
+    found = fit.d.copy()
+    found[1:] -= np.where(intervals.linked[:, None], fit.rho, 0.0) * found[:-1]
     return np.asarray(found / innovation_std(intervals, fit))
 
 

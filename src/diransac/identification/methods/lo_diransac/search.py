@@ -74,7 +74,7 @@ class Searched:
 
     ``decided`` is the outcome of a competition; None where there was none.  ``impossible`` names parameters that would
     violate a strict bound by least squares of the whole motion; the result is that of the fit then.  ``as_likely`` are
-    other parameters (n,) that explain the logs as well.
+    other parameters (n,) that explain the logs as well, or that have the answer's response and predict nearly as well.
     """
 
     motion: Motion

@@ -59,9 +59,9 @@ class TermRegression:
         Change of the parameters per unit of each coefficient.
     direct : (K,) array
         Information of each coefficient, if all else were known.
-    residuals : (W, m) array
-        Of each interval, over their standard deviations.
-    columns : (W, m, K) array
+    residuals : (G, m) array
+        Of each interval, or of each group of neighbouring ones, over their standard deviations.
+    columns : (G, m, K) array
         Their derivatives with respect to the coefficients.
     force : (W, e) array
         Unmodelled force in each equation, mean of each interval.

@@ -1,14 +1,15 @@
 """The regression of a fit's residuals on candidate terms, with all else that is estimated beside them.
 
 A term accelerates the model, as the unmodelled accelerations do, so that its slopes are in the normal equations.  One
-solution of these for all terms gives the residuals' slopes by the coefficients.  Long logs are cut into sections, and
-residuals of neighbouring intervals are gathered, so that memory is bounded.
+solution of these for all terms gives the residuals' slopes by the coefficients.  Long logs are solved section by
+section, and residuals of neighbouring intervals are gathered, which takes a fraction of the memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation import GaussNewtonBatch
 
-# Numbers of equations that are solved at once, and of all gathered residuals, at most (80 MB, a tenth of a second).
-_MOST = 1e7
+# Numbers of equations that are solved at once (80 MB, a tenth of a second), and of all residuals (400 MB), at most.
+_MOST, _RESIDUALS = 1e7, 5e7
 # Factor of the prior of discrepancies that holds them at zero.
 _HELD = 1e-3
 # Part of the information of an interval that is rounding.
@@ -90,7 +91,7 @@ def term_regression(
     sections = _sections(len(intervals), parts, _numbers(fit, accelerations.shape[2]))
     direct, of_s = (np.sum(x, axis=0) for x in zip(*map(pushed.of_shared, sections), strict=True))
     solved, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
-    rows = [_gathered(pushed.residuals(k, sections, solved, s), parts, len(sections)) for k in range(len(sections))]
+    rows = _gathered((pushed.residuals(k, sections, solved, s) for k in range(len(sections))), len(inertia), parts)
     effects, forces = result.of_s.T @ s[:, :-1], list[FloatArray]()
     for part, z in zip(sections, solved, strict=True):
         # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
@@ -113,7 +114,7 @@ def term_regression(
 
 @dataclass(frozen=True)
 class _Pushed:
-    """A fit and its normal equations, all and those of the measurements, with accelerations (W, n_v, K) of K terms."""
+    """A fit that accelerations (W, n_v, K) of K terms push; its normal equations, all and of the measurements alone."""
 
     intervals: ShootingIntervals
     fit: Fit
@@ -133,12 +134,9 @@ class _Pushed:
         return jumps, self.at.precision[links, :, None] * jumps
 
     def of_shared(self, part: slice) -> tuple[FloatArray, FloatArray]:
-        """Of some intervals: information (K,) of each coefficient, if all else were known, and (n_s, K) as below."""
-        n_x, k, links = (
-            self.fit.x.shape[1],
-            self.at.right_z.shape[1],
-            slice(part.start, min(part.stop, len(self.at.jumps))),
-        )
+        """Of some intervals: information (K,) of each coefficient alone, and right-hand sides (n_s, K)."""
+        n_x, k = self.fit.x.shape[1], self.at.right_z.shape[1]
+        links = slice(part.start, min(part.stop, len(self.at.jumps)))
         own, by_d, (jumps, force) = self.accelerations[part], self.by_d[part], self.jumps(links)
         direct = (own * (by_d[:, n_x:k] @ own)).sum(axis=(0, 1)) + (jumps * force).sum(axis=(0, 1))
         of_jumps = sum_of_products(self.intervals, self.at.slopes[links, :, k:].swapaxes(1, 2), force, part)
@@ -218,15 +216,28 @@ def _numbers(fit: Fit, n_terms: int) -> float:
     return float(n_terms * (n + 2 * k) + n**2)
 
 
-def _gathered(rows: FloatArray, parts: int, n_sections: int) -> FloatArray:
-    """Residuals of intervals of so many parts; of one of several sections as few of groups, with the same products."""
-    rows = rows.reshape(len(rows) // parts, -1, rows.shape[2])
-    if n_sections == 1:
-        return rows
-    length = -(-len(rows) // max(int(_MOST / rows.shape[2] ** 2) // n_sections, 1))
-    groups = (rows[k : k + length].reshape(-1, rows.shape[2]) for k in range(0, len(rows), length))
-    triangles = [np.linalg.qr(x, mode="r") for x in groups]
-    return np.stack([np.pad(x, ((0, rows.shape[2] - len(x)), (0, 0))) for x in triangles])
+def _gathered(sections: Iterable[FloatArray], n_intervals: int, parts: int) -> list[FloatArray]:
+    """Residuals (W, m, K + 2) of sections, an interval of the estimate in each row.
+
+    Where these are too many, as few rows of groups of neighbouring intervals, with the same squares and products: the
+    triangle of a QR decomposition.
+    """
+    found, length, first = list[FloatArray](), 0, 0
+    for rows in sections:
+        rows = rows.reshape(len(rows) // parts, -1, rows.shape[2])
+        n = rows.shape[2]
+        length = length or (-(-n_intervals * n**2 // int(_RESIDUALS)) if n_intervals * rows[0].size > _RESIDUALS else 1)
+        if length == 1:
+            found.append(rows)
+            continue
+        edges = [0, *range(-first % length or length, len(rows), length), len(rows)]
+        for begin, end in pairwise(edges):
+            piece = rows[begin:end].reshape(-1, n)
+            if (first + begin) % length:
+                piece = np.concatenate([found.pop(), piece])
+            found.append(np.asarray(np.linalg.qr(piece, mode="r")))
+        first += len(rows)
+    return found if length == 1 else [np.pad(x, ((0, x.shape[1] - len(x)), (0, 0)))[None] for x in found]
 
 
 def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:

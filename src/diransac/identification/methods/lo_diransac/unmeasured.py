@@ -176,9 +176,9 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     """
     from diransac.identification.regression.multistart import least_squares
 
-    (width, *first), *stages = _STAGES
+    (width, n_steps, n_kept), *stages = _STAGES
     problem = replace(_observers(intervals, motion), bandwidth=width / intervals.duration)
-    z = problem.best_starts([(first[0], first[1])])
+    z = problem.best_starts([(n_steps, n_kept)])
     for width, n_steps, n_kept in stages:
         problem = replace(problem, bandwidth=width / intervals.duration)
         z, cost = least_squares(problem, z, n_steps)
