@@ -633,25 +633,8 @@ def test_a_log_whose_inputs_act_at_another_time_is_named():
 
 def test_a_log_that_is_too_short_to_be_compared_is_named():
     logs = [sliding(0, 800, 0.0), sliding(1, 800, 0.0), sliding(2, 40, 0.0)]
-    result = dr.identify(SLIDER, logs, "i-diransac", settings=dr.Settings(sample_size=75, max_iterations=20))
+    result = dr.identify(SLIDER, logs)
     assert any(note.startswith("slide 2 could not be compared with the other logs") for note in result.notes)
-
-
-def test_each_log_alone_follows_from_an_exact_fit_of_all():
-    """To first order: a log that is identified alone gives the same, within its errors."""
-    logs = [sliding(k, n, 0.1 * k) for k, n in enumerate((800, 400, 200))]
-    found = dr.identify(SLIDER, logs).estimate.of_logs
-    assert len(found) == 3
-    for own, log in zip(found, logs, strict=True):
-        alone = dr.identify(SLIDER, log)
-        error = alone.standard_errors["mass"]
-        assert own.parameters["mass"] == pytest.approx(alone.parameters["mass"], abs=0.5 * error)
-        assert own.standard_errors["mass"] == pytest.approx(error, rel=0.5)
-    wide = [x.standard_errors["mass"] for x in found]
-    assert wide[0] < wide[1] < wide[2]
-    biases = [x.parameters[f"bias[{i}]"] for i, x in enumerate(found)]
-    assert biases == pytest.approx([0.0, 0.1, 0.2], abs=0.05)
-    assert np.isinf(found[0].standard_errors["bias[1]"])
 
 
 def test_json_has_parameters_by_their_names_and_those_of_every_log():

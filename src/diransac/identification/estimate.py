@@ -172,7 +172,8 @@ class Estimate:
     possible_terms : tuple of PossibleTerm, optional
         Terms that the model may lack, with their weights; None: they were not tested.
     of_logs : tuple of LogEstimate, optional
-        Estimates from each of several logs alone; empty where a further fit of each gives them.
+        Estimates from each of several logs alone; empty where they are not compared with each other, or a fit of each
+        log is fast.
     """
 
     parameters: Values

@@ -18,7 +18,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
 from diransac.identification.diagnosis import Diagnosis, Resolution
-from diransac.identification.estimate import TIME_LIMIT, Estimate, LogEstimate
+from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
@@ -26,7 +26,7 @@ from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
-from diransac.identification.methods.lo_diransac.parts import compared_parts, estimates_of_exact_logs
+from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
@@ -345,19 +345,8 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if best.decided is None else best.decided.summary,
         possible_terms=possible_terms(found.candidates, result, covariance, names) if found.candidates else None,
-        of_logs=_of_logs(best, result),
+        of_logs=best.decided.of_logs if best.decided else (),
     )
-
-
-def _of_logs(best: Searched, result: ProjectedEstimate) -> tuple[LogEstimate, ...]:
-    """Estimates of each of several logs alone; none where only another fit of each gives them."""
-    likeliest = best.likeliest
-    if best.decided is not None:
-        return best.decided.of_logs
-    if likeliest.exact and likeliest.complete and likeliest.intervals.layout.n_logs > 1:
-        with suppress(np.linalg.LinAlgError):
-            return estimates_of_exact_logs(likeliest.intervals, likeliest.refinement.fit, result)
-    return ()
 
 
 def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.estimate import LogEstimate
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
 from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals, weights_of
@@ -146,50 +145,6 @@ def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
     if found.exact:
         return _deviating(intervals, fit, result, share)
     return _changing(intervals, fit, result, share)
-
-
-def estimates_of_exact_logs(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate
-) -> tuple[LogEstimate, ...]:
-    """Estimates of each log alone, to first order about an exact fit of all of them.
-
-    Measurements of a log with information ``I`` and gradient ``g`` change the parameters by ``I^-1 g``.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    result : ProjectedEstimate
-
-    Returns
-    -------
-    tuple of LogEstimate
-        Standard errors are infinite where a log does not tell a parameter.
-
-    Raises
-    ------
-    LinAlgError
-        The logs together do not determine the parameters.
-    """
-    layout, effect = intervals.layout, effect_of_intervals(intervals, fit)
-    variances = variances_of_intervals(intervals, fit, weights_of(intervals, fit), effect.z, effect.s)
-    unit = np.sqrt(np.diag(effect.covariance)) + _TINY
-    scales, wider = np.outer(unit, unit), np.sqrt(np.diag(result.covariance)) / unit
-    inverse, found = np.linalg.inv(effect.covariance / scales), []
-    for i, at in enumerate(layout.index):
-        own = intervals.log_of == i
-        information = (inverse @ (variances[own].sum(axis=0) / scales) @ inverse)[np.ix_(at, at)]
-        gradient = (inverse @ (effect.steps[own].sum(axis=0) / unit))[at]
-        sizes, axes = np.linalg.eigh(information)
-        informed = sizes > _ROUNDING * sizes[-1]
-        sizes, lost, axes = sizes[informed], axes[:, ~informed], axes[:, informed]
-        values, errors = result.parameters.copy(), np.full(len(layout), np.inf)
-        values[at] += unit[at] * (axes @ (axes.T @ gradient / sizes))
-        variance = np.where(np.square(lost).sum(axis=1) > _ROUNDING, np.inf, (np.square(axes) / sizes).sum(axis=1))
-        errors[at] = (unit * wider)[at] * np.sqrt(variance)
-        parameters, spans = (dict(zip(layout.names, x.tolist(), strict=True)) for x in (values, errors))
-        found.append(LogEstimate(parameters, spans))
-    return tuple(found)
 
 
 def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
