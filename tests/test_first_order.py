@@ -410,6 +410,8 @@ def test_the_liveliest_stretch_is_where_inputs_change_and_samples_count(monkeypa
     assert first.stop >= 0.45 * n - 1
     assert second.start == n // 2  # the step is where nothing was sampled
     assert stretches.begin[0, 0] == problem.samples[first.start, 0]
+    slow = replace(two, weights=np.where(rows[:, None] % 10 == 0, known, 0.0))._on_stretches(0.5).rows_of_logs
+    assert slow[0] == first  # samples that are slower than inputs
     short = two._on_stretches(0.01).rows_of_logs[1]
     assert short.stop - short.start == n // 8  # enough of each log
 

@@ -22,7 +22,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.log import Log
 from diransac.data.segment import Segment
-from diransac.errors import DiransacError
+from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.regression.estimators import (
     OrdinaryLeastSquares,
     Selection,
@@ -96,6 +96,8 @@ def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[Motio
             columns = dict(zip(chain.from_iterable(names), np.hstack([one.q, one.v, one.a, one.u]).T, strict=True))
             logs.append(Log.from_arrays(np.arange(float(len(one.q))), columns, source=f"log {len(logs)}"))
         bound = NonlinearLeastSquares().bind(Dataset.of(model, logs, pointwise=True))
+    except TimeLimitError:
+        raise
     except (DiransacError, np.linalg.LinAlgError):
         return None
     nothing = NullSpace(np.zeros((0, len(layout))), np.ones(len(layout)))

@@ -220,14 +220,13 @@ class ObserverFit:
         for n_steps, n_kept in steps:
             z, cost = least_squares(some, z, n_steps)
             z = z[np.argsort(cost, kind="stable")[:n_kept]]
-        return z if some is self else self._begun(z)
+        return z if some.rows_of_logs == self.rows_of_logs else self._begun(z)
 
     def _on_stretches(self, part: float) -> ObserverFit:
         """The same on a part of each log, in which its inputs change most; samples are where states start from."""
         rows_of_logs, begin, size = [], self.begin.copy(), self.inputs.std(axis=0)
         steps = np.square(np.diff(self.inputs, axis=0) / np.where(size > 0.0, size, 1.0)).sum(axis=1)
-        seen = np.asarray(self.weights.any(axis=1))
-        steps *= seen[1:] & seen[:-1]
+        steps *= self._near_samples[1:]
         states = [self.observer.state.index(n) for n in self.compared]
         sampled = [(i, j) for j, i in enumerate(states) if i < len(self.found)]
         for start, rows in zip(begin, self.rows_of_logs, strict=True):
@@ -239,6 +238,16 @@ class ObserverFit:
             for i, j in sampled:
                 start[i] = self.samples[first, j]
         return replace(self, rows_of_logs=rows_of_logs, begin=begin)
+
+    @property
+    def _near_samples(self) -> FloatArray:
+        """1 for rows ``(N,)`` of a usual sampling time about a sample that counts, else 0."""
+        seen = np.flatnonzero(self.weights.any(axis=1))
+        apart = int(np.median(np.diff(seen))) if len(seen) > 1 else 1
+        near = np.zeros(len(self.weights) + 2 * apart)
+        for k in range(2 * apart + 1):
+            near[seen + k] = 1.0
+        return near[apart : len(self.weights) + apart]
 
     def _places(self, log: int) -> IntArray:
         """Places of a log's parameters and initial states among the unknowns."""

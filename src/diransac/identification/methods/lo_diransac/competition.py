@@ -308,17 +308,19 @@ class Contest:
 
         What the model lacks does not tell them apart.
         """
-        one, found = self.candidates[judged.comparison.best], list[FloatArray]()
+        one, others = self.candidates[judged.comparison.best], list(search.as_likely)
 
         def errors(p: FloatArray) -> FloatArray:
             everywhere = np.repeat(p[None], self.blocks.n, axis=0)
             return judged.arbiter.scores(replace(one, parameters=p, without=everywhere)).errors
 
         with suppress(TimeLimitError, np.linalg.LinAlgError):  # what was decided stays
-            for p in equivalents_of(self.dataset, self.intervals, parameters):
-                if predicts(errors(p)) and (errors(p) < _NEARLY * errors(parameters)).all():
-                    found.append(p)
-        return tuple(p for p in (*found, *search.as_likely) if not is_close(p, parameters).all())
+            others = equivalents_of(self.dataset, self.intervals, parameters) + others
+        others = [p for p in others if not is_close(p, parameters).all()]
+        if not others:
+            return ()
+        own, found = errors(parameters), [(p, errors(p)) for p in others]
+        return tuple(p for p, x in found if predicts(x) and (x < _NEARLY * own).all())
 
     def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""

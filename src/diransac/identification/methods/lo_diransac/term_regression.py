@@ -226,18 +226,17 @@ def _gathered(sections: Iterable[FloatArray], n_intervals: int, parts: int) -> l
     for rows in sections:
         rows = rows.reshape(len(rows) // parts, -1, rows.shape[2])
         n = rows.shape[2]
-        length = length or (-(-n_intervals * n**2 // int(_RESIDUALS)) if n_intervals * rows[0].size > _RESIDUALS else 1)
-        if length == 1:
+        if n_intervals * rows[0].size <= _RESIDUALS:
             found.append(rows)
             continue
-        edges = [0, *range(-first % length or length, len(rows), length), len(rows)]
-        for begin, end in pairwise(edges):
+        length = -(-n_intervals * n**2 // int(_RESIDUALS))
+        for begin, end in pairwise([0, *range(-first % length or length, len(rows), length), len(rows)]):
             piece = rows[begin:end].reshape(-1, n)
             if (first + begin) % length:
                 piece = np.concatenate([found.pop(), piece])
             found.append(np.asarray(np.linalg.qr(piece, mode="r")))
         first += len(rows)
-    return found if length == 1 else [np.pad(x, ((0, x.shape[1] - len(x)), (0, 0)))[None] for x in found]
+    return [np.pad(x, ((0, x.shape[1] - len(x)), (0, 0)))[None] for x in found] if length else found
 
 
 def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
