@@ -7,13 +7,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import diransac as dr
 from command_line import MODEL, run, working_folder
 from diransac import time_limit
+from diransac.data.dataset import Dataset
 from diransac.identification.estimate import TIME_LIMIT
+from diransac.identification.identify import _mistakes
 from diransac.simulation.compiler import compile_map, machine_code
 from diransac.simulation.compiler.machine_code import run_blocks
 from diransac.time_limit import check_time, time_left, time_limited, time_unlimited
@@ -210,3 +213,18 @@ def test_an_error_in_a_loop_is_raised():
     for threads in (1, 2):
         with pytest.raises(ZeroDivisionError, match="planted"):
             run_blocks(call, [], 20, threads)
+
+
+def test_a_search_for_mistakes_that_time_ended_is_made_again():
+    """Methods on one dataset share its result; an empty one would be no result."""
+    model = dr.Model(
+        "slide", {"s": "m"}, {"force": "N"},
+        {"mass": dr.Parameter("kg", positive=True), "k": dr.Parameter("1/s", positive=True)},
+        lambda q, v, a, u, p: [p.mass * a.s + ca.tanh(p.k * v.s) - u.force],
+    )  # fmt: skip
+    t = 0.01 * np.arange(300)
+    columns = {"s": np.sin(t), "s_dot": np.cos(t), "s_ddot": -np.sin(t), "force": np.tanh(np.cos(t)) - 2.0 * np.sin(t)}
+    dataset = Dataset.of(model, [dr.Log.from_arrays(t, columns)], pointwise=True)
+    with time_limited(1e-9):
+        assert _mistakes(dataset) == ([], 0)
+    assert _mistakes(dataset)[1] > 0
