@@ -15,7 +15,7 @@ from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
-from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on
+from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on, signal_rates
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
@@ -433,12 +433,12 @@ def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts(late):
 
     def after(right):
         step = at.step(right)
-        there = at.moved(intervals, step)
+        there = at.moved(step)
         return step, there, moved(there, fit, step.of_fit.step_z, step.of_fit.step_p)
 
     step, there, plain = after(at.right)
     assert bool(step.sizes.any()) == late
-    _, then, corrected = after(at.corrected(there, fit, plain, step))
+    _, then, corrected = after(at.corrected(there, plain, step))
     broken, kept, best = cost(there, plain, weights), cost(then, corrected, weights), cost(intervals, fit, weights)
     assert kept < 0.01 * broken
     assert (weights * np.square(corrected.residuals)).sum() < 1.1 * (weights * np.square(plain.residuals)).sum()
@@ -460,10 +460,25 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
 
     monkeypatch.setattr(gauss_newton, "_CORRECTED", 0.0)
     monkeypatch.setattr(gauss_newton, "cost", failing)
-    step = gauss_newton.gauss_newton_step(intervals, fit, at, begin)
+    step = gauss_newton.gauss_newton_step(at, begin)
     assert cost(step.intervals, step.fit, weights) < before
     np.testing.assert_allclose([step.damped, step.damping], [damped, following])
     np.testing.assert_array_equal(step.solved.var_p, at.step(at.right).of_fit.var_p)
+
+
+def test_a_step_is_compared_with_no_step_where_fractions_of_a_sample_were_corrected_by_the_rates_of_another_fit():
+    intervals, signals = intervals_of(n_rows=200)
+    late, fit = ErrorKind((0, 1, 2), "delay"), perturbed_fit(intervals, signals)
+    other = replace(fit, x=fit.x + 0.3, shared=0.5 * fit.shared)
+    intervals = intervals.corrected({late: 0.4}, signal_rates(intervals, with_residuals(intervals, other)))
+    at = JointEquations.of(intervals, with_residuals(intervals, fit), (late,))
+    step = at.step(at.right)
+    there = at.moved(replace(step, sizes=1e-9 * step.sizes))
+    before, after = (
+        cost(x, y, at.of_fit.weights) for x, y in ((at.intervals, at.fit), (there, with_residuals(there, at.fit)))
+    )
+    assert after == pytest.approx(before, rel=1e-6)
+    assert cost(intervals, with_residuals(intervals, fit), at.of_fit.weights) != pytest.approx(before, rel=1e-3)
 
 
 def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():

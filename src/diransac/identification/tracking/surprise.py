@@ -109,7 +109,7 @@ def followed(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, Factored]:
         # Three quarters of the samples are no outliers; of a standard normal x, this quantile of |x| is 1.15.
         scale = [np.quantile(x[k], 0.75) / 1.15 if k.any() else 0.0 for x, k in samples]
         fit = replace(fit, noise=replace(usual, sigma=np.maximum(usual.sigma, scale)))
-        taken = gauss_newton_step(intervals, fit, linearized(intervals, fit), damping)
+        taken = gauss_newton_step(linearized(intervals, fit), damping)
         moved = np.abs(taken.fit.x - fit.x)
         fit, damping = taken.fit, taken.damping
         if (moved <= 0.1 * np.sqrt(taken.solved.var_z[:, : moved.shape[1]])).all():

@@ -239,7 +239,7 @@ class Window:
         for _ in range(_MOST_STEPS):
             at = linearized(intervals, self.fit, weights)
             before = self.fit
-            taken = gauss_newton_step(intervals, before, at, damping)
+            taken = gauss_newton_step(at, damping)
             solved, damping = taken.solved, taken.damping
             self.last = Linearization(intervals, before, at.of_fit, solved)
             self.fit = self._with_scales(intervals, taken.fit, solved)

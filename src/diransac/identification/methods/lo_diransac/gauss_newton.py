@@ -59,13 +59,11 @@ class Step:
         return (self.at.step(self.at.right) if self.damped else self.taken).of_fit
 
 
-def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations, damping: float) -> Step:
+def gauss_newton_step(at: JointEquations, damping: float) -> Step:
     """One Gauss-Newton step within the bounds, corrected or damped until the cost falls.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
-    fit : Fit
     at : JointEquations
         Result of `linearized`.
     damping : float
@@ -74,13 +72,13 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
     -------
     Step
     """
-    weights = at.of_fit.weights
+    intervals, fit, weights = at.intervals, at.fit, at.of_fit.weights
     before = cost(intervals, fit, weights)
     for trials in range(_MAX_TRIALS):
         right, excess = at.right, np.inf
         while True:
             step = at.step(right, damping)
-            there = at.moved(intervals, step)
+            there = at.moved(step)
             if there is None:
                 break
             trial = after_step(there, fit, step.of_fit)
@@ -91,7 +89,7 @@ def gauss_newton_step(intervals: ShootingIntervals, fit: Fit, at: JointEquations
                 return Step(there, trial, at, step, damping, least, of_errors)
             if not more < _CORRECTED * excess:
                 break
-            right, excess = at.corrected(there, fit, trial, step), more
+            right, excess = at.corrected(there, trial, step), more
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return Step(intervals, fit, at, step, damping, damping, 0.0)
 

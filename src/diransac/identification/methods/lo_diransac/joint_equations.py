@@ -142,8 +142,12 @@ class Scores:
 
     def __init__(self, intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> None:
         self.intervals, self.fit = intervals, fit
-        self.weights = weights_of(intervals, fit) if weights is None else weights
-        self.at = linearize(intervals, fit, self.weights)
+        if intervals.all_errors.delay.any():
+            # Fractions of a sample are corrected by the rates of this fit, so that a step is compared with no step.
+            self.intervals = intervals.corrected({}, self.rates)
+            self.fit = replace(fit, residuals=fit.residuals + intervals.measured - self.intervals.measured)
+        self.weights = weights_of(self.intervals, self.fit) if weights is None else weights
+        self.at = linearize(self.intervals, self.fit, self.weights)
 
     @cached_property
     def rates(self) -> FloatArray:
@@ -260,6 +264,10 @@ class JointEquations:
 
     Parameters
     ----------
+    intervals : ShootingIntervals
+        Recordings are corrected by the rates of this fit.
+    fit : Fit
+        Where they are linearised, with its residuals.
     of_fit : NormalEquations
         Of the fit alone.
     kinds : tuple of ErrorKind
@@ -273,6 +281,8 @@ class JointEquations:
         Derivative of the cost.
     """
 
+    intervals: ShootingIntervals
+    fit: Fit
     of_fit: NormalEquations
     kinds: tuple[ErrorKind, ...]
     rates: FloatArray
@@ -308,6 +318,8 @@ class JointEquations:
 
         at = scores.at
         return cls(
+            intervals=scores.intervals,
+            fit=scores.fit,
             of_fit=at,
             kinds=tuple(kinds),
             rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros_like(intervals.measured),
@@ -352,22 +364,20 @@ class JointEquations:
         moved = replace(alone, step_z=alone.step_z - of_z @ sizes, step_p=alone.step_p - of_s @ sizes)
         return JointStep(moved, sizes, std, covariance)
 
-    def moved(self, intervals: ShootingIntervals, step: JointStep) -> ShootingIntervals | None:
+    def moved(self, step: JointStep) -> ShootingIntervals | None:
         """The intervals with errors after a step; None if one is impossible.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
-            Of these equations.
         step : JointStep
         """
         if not step.sizes.any():
-            return intervals
+            return self.intervals
         sizes = dict(zip(self.kinds, step.sizes.tolist(), strict=True))
-        possible = all(is_possible(intervals, kind, x) for kind, x in sizes.items())
-        return intervals.corrected(sizes, self.rates) if possible else None
+        possible = all(is_possible(self.intervals, kind, x) for kind, x in sizes.items())
+        return self.intervals.corrected(sizes, self.rates) if possible else None
 
-    def corrected(self, intervals: ShootingIntervals, fit: Fit, moved: Fit, step: JointStep) -> Right:
+    def corrected(self, intervals: ShootingIntervals, moved: Fit, step: JointStep) -> Right:
         """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
 
         Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
@@ -376,8 +386,6 @@ class JointEquations:
         Parameters
         ----------
         intervals : ShootingIntervals
-        fit : Fit
-            Of these equations.
         moved : Fit
             After the other step.
         step : JointStep
@@ -389,7 +397,7 @@ class JointEquations:
             Not finite where a rollout diverges.
         """
         at = self.of_fit
-        more = at.excess(intervals, fit, moved) - self.jumps @ step.sizes
+        more = at.excess(intervals, self.fit, moved) - self.jumps @ step.sizes
         of_z, of_s = at.by_jumps(intervals, more)
         of_e = np.einsum("wi,wi,wie->e", at.precision, np.where(intervals.linked[:, None], more, 0.0), self.jumps)
         right_z, right_s, right_e = self.right

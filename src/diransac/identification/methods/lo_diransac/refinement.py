@@ -273,13 +273,13 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
-        taken = gauss_newton_step(intervals, fit, at, damping)
+        taken = gauss_newton_step(at, damping)
         intervals, solved, damping = taken.intervals, taken.solved, taken.damping
         updated = _update(settings, intervals, taken.fit, solved, prior)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
-        converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(fit, updated, errors)
-        fit, at = updated, linearized(intervals, updated)
-    return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
+        converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors)
+        at = linearized(intervals, updated)
+    return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
 
 def refine_exact(
@@ -318,19 +318,21 @@ def refine_exact(
     while steps < settings.max_steps and not converged and not _is_lost(intervals, losses, settings, rival):
         check_time()
         steps += 1
-        taken = gauss_newton_step(intervals, fit, at, damping)
+        taken = gauss_newton_step(at, damping)
         intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
         losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
-        tau = np.maximum(least, _TIGHTENED * fit.tau)
-        jumps = np.clip(unbroken_jumps(fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
-        continuity = np.maximum(jumps, _TIGHTENED * fit.continuity_std)
+        tau = np.maximum(least, _TIGHTENED * at.fit.tau)
+        jumps = (
+            np.clip(unbroken_jumps(at.fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
+        )
+        continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
-        settled = bool((tau == fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
-        converged = settled and _unchanged(fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
-        fit, at = updated, linearized(intervals, updated)
-    return Refinement(intervals, fit, _evidence(intervals, fit, at), steps, converged)
+        settled = bool((tau == at.fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
+        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        at = linearized(intervals, updated)
+    return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
 
 def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: LoDiransacSettings, rival: float) -> bool:
@@ -342,11 +344,13 @@ def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: Lo
     return bool(losses[-1] - rival > intervals.known.sum() + left * best)
 
 
-def _evidence(intervals: ShootingIntervals, fit: Fit, at: JointEquations) -> float:
+def _evidence(at: JointEquations) -> float:
     """Negative log evidence of a fit at its optimum; infinite where a rollout diverges."""
-    if diverges(fit):
+    if diverges(at.fit):
         return np.inf
-    return negative_log_evidence(intervals, fit, at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s).log_det)
+    return negative_log_evidence(
+        at.intervals, at.fit, at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s).log_det
+    )
 
 
 def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float) -> float:
