@@ -371,7 +371,6 @@ def test_logs_of_a_machine_that_the_model_does_not_describe_agree_unless_one_has
         dr.identify(SLIDER, [rubbing(k, x) for k, x in enumerate(masses)], differentiate=True)
         for masses in ((2.0, 2.0, 2.0), (2.0, 4.0, 2.0))
     )
-    assert len(other.estimate.of_logs) == 3
     assert [x.remark for x in alike.logs] == [""] * 3
     assert [bool(x.remark) for x in other.logs] == [False, True, False]
     assert "mass" in other.logs[1].remark
@@ -629,6 +628,17 @@ def test_a_log_whose_inputs_act_at_another_time_is_named():
     result = dr.identify(SLIDER, logs)
     assert "input delay" in result.logs[2].remark
     assert [bool(x.remark) for x in result.logs] == [False, False, True]
+
+
+def test_estimates_of_logs_are_those_of_each_identified_alone():
+    logs = [sliding(0, 800, 0.2), sliding(1, 600, 0.0), sliding(2, 1000, -0.1)]
+    method, dataset = dr.LoDiransac(), Dataset.of(SLIDER, logs)
+    method.fit(dataset, 0)
+    for own, log in zip(method.estimates_of_logs(dataset, 0), logs, strict=True):
+        alone = dr.identify(SLIDER, log)
+        for name, error in alone.standard_errors.items():
+            assert own.parameters[name] == pytest.approx(alone.parameters[name], abs=0.3 * error)
+            assert own.standard_errors[name] == pytest.approx(error, rel=0.3)
 
 
 def test_a_log_that_is_too_short_to_be_compared_is_named():

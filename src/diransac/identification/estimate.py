@@ -171,9 +171,6 @@ class Estimate:
         Comparison with other estimates; None where the exact model predicts the logs within their noise.
     possible_terms : tuple of PossibleTerm, optional
         Terms that the model may lack, with their weights; None: they were not tested.
-    of_logs : tuple of LogEstimate, optional
-        Estimates from each of several logs alone; empty where they are not compared with each other, or a fit of each
-        log is fast.
     """
 
     parameters: Values
@@ -195,7 +192,6 @@ class Estimate:
     suggestions: tuple[Suggestion, ...] = ()
     competition: Competition | None = None
     possible_terms: tuple[PossibleTerm, ...] | None = None
-    of_logs: tuple[LogEstimate, ...] = ()
 
     def __post_init__(self) -> None:
         covariance = np.array(self.covariance, np.float64).reshape(len(self.parameters), len(self.parameters))

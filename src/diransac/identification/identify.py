@@ -300,9 +300,7 @@ class _Task:
         evaluation = evaluate(estimate, dataset, scoring, criteria)
         remarks, incomparable = [""] * len(logs), list[str]()
         if self.compares:
-            remarks, incomparable = disagreements(
-                self.method, estimate, dataset, self.seed, within(progress, fitted, 1.0)
-            )
+            remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         result = Result(
             model=known.model,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from diransac.data.dataset import Dataset
 from diransac.errors import DiransacError, TimeLimitError
-from diransac.identification.estimate import Estimate, LogEstimate
+from diransac.identification.estimate import LogEstimate
 from diransac.identification.method import Callback, Method, fit, within
 from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
@@ -17,18 +18,26 @@ _DELAY = "input delay [s]"
 """Name of the delay of the inputs in a sentence."""
 
 
+@runtime_checkable
+class ComparesLogs(Protocol):
+    """A method whose fit of several logs gives estimates of each of them."""
+
+    def estimates_of_logs(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[LogEstimate]:
+        """Estimates of each log alone, after `Method.fit` of all; empty where that gives none."""
+
+
 def disagreements(
-    method: Method, estimate: Estimate, dataset: Dataset, seed: int, callback: Callback | None = None
+    method: Method, dataset: Dataset, seed: int, callback: Callback | None = None
 ) -> tuple[list[str], list[str]]:
     """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
 
     The second list has a sentence on every log that cannot be compared, because alone it gives no estimate.
 
-    Each log's own estimate is `Estimate.of_logs`, where the method has it; otherwise the log is identified alone.  A
-    shared parameter of log ``i`` is compared with the precision-weighted mean of the other logs: ``|p_i - p| > t sqrt(B
-    (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and the Birge ratio ``B >= 1`` of the
-    others' scatter to their intervals.  The worst log is set aside and the others are compared again, so that one
-    deviating log does not make the rest disagree.  Input delays are compared likewise.
+    Each log's own estimate is the method's (`ComparesLogs`), where it has one; otherwise the log is identified alone.
+    A shared parameter of log ``i`` is compared with the precision-weighted mean of the other logs, ``|p_i - p| > t
+    sqrt(B (C_i + C))``, with Student's ``t`` at the level shared among all comparisons and the Birge ratio ``B >= 1``
+    of the others' scatter to their intervals.  The worst log is set aside and the others are compared again, so that
+    one deviating log does not make the rest disagree.  Input delays are compared likewise.
 
     References
     ----------
@@ -38,15 +47,11 @@ def disagreements(
     n, remarks, notes = len(dataset.segments), [""] * len(dataset.segments), list[str]()
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
     found: dict[int, LogEstimate] = {}
-    for i in range(n):
-        own: LogEstimate | str
-        if estimate.of_logs:
-            own = estimate.of_logs[i]
-        else:
-            try:
-                own = _alone(method, dataset, i, seed, within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: "))
-            except TimeLimitError:
-                return remarks, ["the time limit was reached before the logs were compared with each other"]
+    try:
+        every = _each(method, dataset, seed, callback)
+    except TimeLimitError:
+        return remarks, ["the time limit was reached before the logs were compared with each other"]
+    for i, own in enumerate(every):
         if not isinstance(own, str) and any(np.isfinite(own.standard_errors[name]) for name in shared):
             found[i] = own
         else:
@@ -64,6 +69,15 @@ def disagreements(
             remarks[i] = f"{dataset.given[i].source} disagrees with the other logs: {tests[i][1]}"
             del found[i]
     return remarks, notes
+
+
+def _each(method: Method, dataset: Dataset, seed: int, callback: Callback | None) -> Sequence[LogEstimate | str]:
+    """The estimate of each log, or the reason why that log alone gives none."""
+    if isinstance(method, ComparesLogs) and (every := method.estimates_of_logs(dataset, seed, callback)):
+        return every
+    n = len(dataset.segments)
+    parts = [within(callback, i / n, (i + 1) / n, f"log {i + 1} alone: ") for i in range(n)]
+    return [_alone(method, dataset, i, seed, part) for i, part in enumerate(parts)]
 
 
 def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callback | None) -> LogEstimate | str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, TimeLimitError
-from diransac.identification.estimate import Competition, Competitor, LogEstimate, predicts
+from diransac.identification.estimate import Competition, Competitor, predicts
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
 from diransac.identification.methods.lo_diransac.interval_effects import effect_of_intervals
@@ -37,7 +37,7 @@ from diransac.identification.methods.lo_diransac.search import (
     with_equivalents,
 )
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
-from diransac.identification.methods.lo_diransac.simulation_error import estimates_of_logs, simulation_error_candidates
+from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
@@ -295,8 +295,9 @@ class Contest:
         winner, origin = self.entries[judged.comparison.best]
         of_fit = not isinstance(origin, Motion)
         result = self._result(judged, search.likeliest)
-        of_logs = self._of_logs(judged, result.parameters)
-        outcome = Decided(self._summary(judged), None if of_fit else winner.acting, of_logs)
+        n_rows = judged.arbiter.steps[int(np.argmin(judged.scores[judged.comparison.best].errors))]
+        answer = replace(winner, parameters=result.parameters)
+        outcome = Decided(self._summary(judged), None if of_fit else winner.acting, answer, n_rows)
         impossible = search.impossible if of_fit else ()
         as_likely = self._as_likely(search, judged, result.parameters)
         return replace(
@@ -371,22 +372,6 @@ class Contest:
         inlying = fit.noise.inlying(fit.residuals, own.known) >= _INLYING
         noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)
         return inlying | ~own.known, np.maximum(noise, floor)
-
-    def _of_logs(self, judged: _Judgement, parameters: FloatArray) -> tuple[LogEstimate, ...]:
-        """Estimates of each of several logs alone, over the horizon at which the winner predicts best.
-
-        None after the time limit: what was decided stays.
-        """
-        if len(self.dataset.segments) < 2:
-            return ()
-        report(self.callback, "comparing logs", 0.895)
-        best = judged.comparison.best
-        n_rows = judged.arbiter.steps[int(np.argmin(judged.scores[best].errors))]
-        one = replace(self.candidates[best], parameters=parameters)
-        try:
-            return estimates_of_logs(one, self.motion, n_rows, outliers=self.settings.outliers)
-        except TimeLimitError:
-            return ()
 
     def _result(self, judged: _Judgement, fit_of: Explanation) -> ProjectedEstimate:
         """Mean of the winner and of those that predict as well, and a covariance that covers them.

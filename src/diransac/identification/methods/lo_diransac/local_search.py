@@ -177,13 +177,41 @@ class LocalSearch:
         yield replace(best, cost_before_errors=before)
         if rival is not None and before > rival.cost_before_errors + AS_LIKELY:
             return
+        for k, found in enumerate(self._with_more_errors(best, free_hold=free_hold)):
+            yield self._shown(replace(found, cost_before_errors=before), 0.6 + 0.03 * k)
+
+    def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
+        """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""
         for k in range(self.settings.max_recording_errors):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:
                 break
             best = self._accurate(min(found, key=lambda x: x.cost))
-            yield self._shown(replace(best, cost_before_errors=before), 0.6 + 0.03 * k)
+            yield best
+
+    def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation, *, free_hold: bool) -> Explanation:
+        """The likeliest explanation of a part of some logs, from a fit of that part with the freedom of all.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+            Of the part, with the errors of all.
+        fit : Fit
+            Of the part.
+        begin : Explanation
+            Of all.
+        free_hold : bool
+            Whether another hold of the inputs may be an explanation.
+
+        Returns
+        -------
+        Explanation
+        """
+        best = self._optimised(begin, intervals, with_residuals(intervals, fit))
+        for other in self._with_more_errors(best, free_hold=free_hold):
+            best = other
+        return best
 
     def _shown(self, found: Explanation, fraction: float) -> Explanation:
         """The explanation itself, which is reported as the best so far."""

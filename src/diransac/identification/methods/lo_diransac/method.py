@@ -24,6 +24,7 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
+from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
@@ -46,6 +47,7 @@ from diransac.process import memory_kept
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.estimate import LogEstimate
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
@@ -163,6 +165,43 @@ class LoDiransac(LoDiransacSettings):
         with memory:
             return _fitted(self, dataset, int(seed), callback)
 
+    def estimates_of_logs(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[LogEstimate]:
+        """Estimates of each of several logs alone, after `fit` of all of them.
+
+        Parameters
+        ----------
+        dataset : Dataset
+        seed : int
+        callback : callable, optional
+            Arguments of `fit`.
+
+        Returns
+        -------
+        list of LogEstimate
+            With infinite standard errors of logs that tell too little.
+
+        Raises
+        ------
+        TimeLimitError
+            The time limit was reached.
+        """
+        try:
+            best = dataset.kept(_key(self, seed), _never_made)
+        except LookupError:  # the model has no equations
+            return []
+        with np.errstate(all="ignore"):  # as in the fit of all
+            return estimates_alone(self, dataset, best, callback)
+
+
+def _key(settings: LoDiransac, seed: int) -> tuple[object, ...]:
+    """Key under which a dataset of several logs keeps the search of all of them."""
+    return "search of all logs", settings, int(seed)
+
+
+def _never_made() -> Searched:
+    """Search of which a dataset has none.  Raises LookupError."""
+    raise LookupError
+
 
 def configured(settings: Settings, **options: Any) -> LoDiransac:
     """The method with its own options, and criteria of the evaluation.
@@ -195,6 +234,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     if unmeasured_states(whole[0]):
         check_structure(dataset.model, dataset.source, allowed, measured_signals(whole[0]), dataset.ranges)
     best = compete(settings, dataset, whole, seed, callback)
+    if len(dataset.segments) > 1:
+        dataset.kept(_key(settings, seed), lambda: best)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     refined = likeliest.refinement
     report(callback, "estimating parameters", 0.9)
@@ -345,7 +386,6 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if best.decided is None else best.decided.summary,
         possible_terms=possible_terms(found.candidates, result, covariance, names) if found.candidates else None,
-        of_logs=best.decided.of_logs if best.decided else (),
     )
 
 

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from diransac.data.segment import Segment
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 
-_FEWEST_INTERVALS = 4
+FEWEST_INTERVALS = 4
+"""Intervals of all logs at least, and of one that is compared with the others."""
+
 _MOST_INPUTS, _MOST_SAMPLES = 15, 31
 """Samples of running medians at most: spikes last for samples, however many of them there are in a second."""
 
@@ -63,10 +65,10 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
     ]
     halves, length = choose_half_widths(model, samples, dt, settings.smoothing_half_width)
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
-    if n_rows < _FEWEST_INTERVALS * length or longest < length:
+    if n_rows < FEWEST_INTERVALS * length or longest < length:
         raise LogError(
             f"{dataset.source}: {n_rows} rows are too few; lo-diransac needs at least "
-            f"{_FEWEST_INTERVALS * length}. Give a longer log"
+            f"{FEWEST_INTERVALS * length}. Give a longer log"
         )
     if not any(long_runs(~x.gaps, length).any() for x in samples):
         raise LogError(

@@ -39,7 +39,7 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.estimate import Competition, LogEstimate
+    from diransac.identification.estimate import Competition
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
     from diransac.identification.methods.lo_diransac.local_search import Explanation
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
+    from diransac.identification.methods.lo_diransac.sources import Candidate
 
 _ALL_OF_IT = 0.8
 """Fraction of a signal's spread from which on its noise leaves nothing to explain, and of its samples for outliers."""
@@ -59,13 +60,14 @@ _TINY = 1e-9
 class Decided:
     """Outcome of a competition.
 
-    Its summary, the inputs of the winner unless it is an estimate of the fit, and the estimates of each of several logs
-    alone.
+    Its summary, the inputs of the winner unless it is an estimate of the fit, the winner with the parameters of the
+    answer, and the rows of the horizon over which it predicts best.
     """
 
     summary: Competition
     acting: ActingInputs | None
-    of_logs: tuple[LogEstimate, ...]
+    answer: Candidate
+    n_rows: int
 
 
 @dataclass(frozen=True)
@@ -256,11 +258,17 @@ def searched(
         )
     search = LocalSearch(settings, motion, able, prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, rival=rival)
-    return Searched(motion, notes, len(hypotheses), likeliest, *_parameters(settings, likeliest))
+    return Searched(motion, notes, len(hypotheses), likeliest, *parameters_of(settings, likeliest))
 
 
-def _parameters(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
-    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these."""
+def parameters_of(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
+    """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    likeliest : Explanation
+    """
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
     if likeliest.exact or not settings.projection:
         return fitted_parameters(intervals, fit), ()

@@ -302,6 +302,15 @@ class ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
 
+    def of_log(self, log: int, layout: ParameterLayout) -> ShootingIntervals:
+        """The intervals of one of the logs, whose parameters are those of a layout of one log."""
+        chosen, errors = self.log_of == log, self.all_errors
+        rows = self.rows_of_logs[log]
+        names = ("measured", "sampled", "recorded", "is_logged", "gaps")
+        errors = replace(errors, measured=errors.measured[rows], sampled=errors.sampled[rows])
+        parts = {n: getattr(self, n)[rows] for n in names}
+        return replace(self, layout=layout, log_of=np.zeros(chosen.sum(), int), errors=errors, **parts)
+
     def parameters_of(self, values: FloatArray, logs: IntArray) -> FloatArray:
         """Model parameters ``(n, n_p)`` of the logs ``(n,)`` from a vector; the vector itself if all are shared."""
         return values if self.layout.is_shared else values[self.layout.index[logs]]

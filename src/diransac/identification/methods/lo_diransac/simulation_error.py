@@ -106,7 +106,7 @@ def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
     return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
 
-def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: bool = True) -> tuple[LogEstimate, ...]:
+def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: bool = True) -> list[LogEstimate]:
     """Estimates of each log alone, by simulation error from an estimate of all of them.
 
     Parameters
@@ -121,7 +121,7 @@ def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: 
 
     Returns
     -------
-    tuple of LogEstimate
+    list of LogEstimate
         With infinite standard errors where a log has fewer segments than blocks.
     """
     intervals, found = one.intervals, []
@@ -139,7 +139,7 @@ def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: 
             parameters, errors = fitted.parameters, fitted.standard_errors(blocks)
         values, spans = (dict(zip(names, x.tolist(), strict=True)) for x in (parameters, errors))
         found.append(LogEstimate(values, spans, late * intervals.dt, late_error * intervals.dt))
-    return tuple(found)
+    return found
 
 
 def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
