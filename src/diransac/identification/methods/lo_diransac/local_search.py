@@ -190,7 +190,7 @@ class LocalSearch:
             best = self._accurate(min(found, key=lambda x: x.cost))
             yield best
 
-    def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation, *, free_hold: bool) -> Explanation:
+    def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation) -> Explanation:
         """The likeliest explanation of a part of some logs, from a fit of that part with the freedom of all.
 
         Parameters
@@ -200,16 +200,14 @@ class LocalSearch:
         fit : Fit
             Of the part.
         begin : Explanation
-            Of all.
-        free_hold : bool
-            Whether another hold of the inputs may be an explanation.
+            Of all; inputs are held as there.
 
         Returns
         -------
         Explanation
         """
         best = self._optimised(begin, intervals, with_residuals(intervals, fit))
-        for other in self._with_more_errors(best, free_hold=free_hold):
+        for other in self._with_more_errors(best, free_hold=False):
             best = other
         return best
 

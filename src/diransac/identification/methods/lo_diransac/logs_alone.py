@@ -75,7 +75,7 @@ def _estimate_of_log(settings: LoDiransacSettings, one: Dataset, found: Searched
     p = fit.shared[: intervals.n_p]
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, p))
     search = LocalSearch(settings, motion, p, prior, None)
-    likeliest = search.continued(intervals, fit, found.likeliest, free_hold=one.input_hold is None)
+    likeliest = search.continued(intervals, fit, found.likeliest)
     own = Searched(motion, (), 1, likeliest, *parameters_of(settings, likeliest))
     errors = np.sqrt(np.diag(own.result.covariance))
     errors[one.layout.on_bounds(own.result.parameters)] = np.inf
