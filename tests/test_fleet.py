@@ -125,6 +125,22 @@ def identified(store: Path, logs: list[Path], method: str = "ols", model: dr.Mod
         return identify_each(model, logs, method, store=store, executor=threads, **arguments)
 
 
+@pytest.mark.parametrize(("batch_size", "n_tasks"), [(None, 2), (30, 2), (3, 20)])
+def test_batches_of_short_logs_are_joined_unless_their_size_is_given(batch_size, n_tasks, tmp_path):
+    class Counting(ThreadPoolExecutor):
+        n_tasks = 0
+
+        def submit(self, *arguments, **named):
+            self.n_tasks += 1
+            return super().submit(*arguments, **named)
+
+    files = [tmp_path / "a" / f"{k}.csv" for k in range(60)]  # that are missing, which takes no time
+    with Counting(1) as threads:
+        options = {"vehicle": PATTERN, "executor": threads, "tasks": 1, "batch_size": batch_size}
+        found = identify_each(MODEL, files, "ols", store=tmp_path / "fleet.db", **options)
+    assert (found.failed, threads.n_tasks) == (60, n_tasks)
+
+
 def test_a_log_whose_file_has_changed_is_identified_again_and_one_that_was_only_copied_is_not(logs, tmp_path):
     store, counts = tmp_path / "fleet.db", list[tuple[int, int]]()
     identified(store, logs[:3])

@@ -12,6 +12,7 @@ import os
 import random
 import signal
 import threading
+import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
@@ -35,6 +36,9 @@ from diransac.simulation import default_threads
 from diransac.study.store import Key, Store, Work
 from diransac.time_limit import time_left, time_limited
 
+# Work of joined batches at most, s: what is lost with a worker, and far more than a task's price.
+_SECONDS = 1.0
+
 Progress = Callable[[int, int], None]
 """Called with (rows present, rows asked for)."""
 
@@ -49,7 +53,7 @@ def run_work(
     store: str | Path,
     executor: Executor | None,
     jobs: int | None,
-    batch_size: int,
+    batch_size: int | None,
     tasks: int | None,
     time_limit: float | None,
     progress: Progress | None,
@@ -61,7 +65,7 @@ def run_work(
     ----------
     work : study or fleet
     compute : of a batch of rows; a row that fails says so, an error ends the run
-    batch_size : trials or logs of a batch
+    batch_size : trials or logs of a batch; None: four, or as many of a level as take about a second
     store, executor, jobs, tasks, time_limit, progress : as in `run_study`
     stale : those of some rows of the store that are to be computed again
 
@@ -87,8 +91,8 @@ def run_work(
         kept.forget(stale(kept, asked))
         finished = kept.finished()
         missing = [key for key in asked if key not in finished]
-        batches = _batches(missing, batch_size)
-        run = _Run(compute, batches, kept, len(asked), progress or (lambda _done, _asked: None))
+        note = progress or (lambda _done, _asked: None)
+        run = _Run(compute, _batches(missing, batch_size or 4), kept, len(asked), note, joins=batch_size is None)
         if executor is not None:
             run.on(executor, tasks)
             return
@@ -103,18 +107,37 @@ def _batches(keys: Iterable[Key], size: int) -> list[tuple[Key, ...]]:
     """Keys in batches of one level and `size` trials at most; a log is a trial."""
     levels: dict[Key, dict[Key, list[Key]]] = defaultdict(lambda: defaultdict(list))
     for key in keys:
-        levels[key[:1] if len(key) > 1 else ()][key[:2]].append(key)
+        levels[_level(key)][key[:2]].append(key)
     of_trials = [list(trials.values()) for trials in levels.values()]
     return [tuple(chain(*some[k : k + size])) for some in of_trials for k in range(0, len(some), size)]
+
+
+def _level(key: Key) -> Key:
+    """Level of a trial; all logs have one."""
+    return key[:1] if len(key) > 1 else ()
+
+
+def _timed(compute: Computation, keys: Sequence[Key]) -> tuple[Sequence[dict[str, Any]], float]:
+    """Rows of a batch, and the seconds that they took a worker."""
+    begin = time.perf_counter()
+    return compute(keys), time.perf_counter() - begin
 
 
 class _Run:
     """Batches that wait and batches that run."""
 
     def __init__(
-        self, compute: Computation, batches: Sequence[tuple[Key, ...]], store: Store, asked: int, progress: Progress
+        self,
+        compute: Computation,
+        batches: Sequence[tuple[Key, ...]],
+        store: Store,
+        asked: int,
+        progress: Progress,
+        *,
+        joins: bool,
     ) -> None:
         self._compute, self._store, self._progress, self._n_asked = compute, store, progress, asked
+        self._joins, self._n_timed, self._seconds = joins, 0, 0.0
         self._missing = set(chain(*batches))
         # Another process on the same store has another order, so that both seldom run the same batch.
         self._waiting = deque((batch, 0) for batch in random.SystemRandom().sample(batches, len(batches)))
@@ -129,7 +152,7 @@ class _Run:
         try:
             while (self._waiting or self._running) and (left := time_left()) > 0.0:
                 while self._waiting and len(self._running) < tasks:
-                    self._hand_out(executor, *self._waiting.popleft())
+                    self._hand_out(executor, *self._next())
                 timeout = left if math.isfinite(left) else None
                 for future in wait(self._running, timeout, return_when=FIRST_COMPLETED).done:
                     self._keep(*self._running.pop(future), future)
@@ -141,6 +164,17 @@ class _Run:
             for future in self._running:
                 future.cancel()
 
+    def _next(self) -> tuple[tuple[Key, ...], int]:
+        """The next batch, joined with those behind it while they are short: a task has its price."""
+        batch, attempts = self._waiting.popleft()
+        each = self._seconds / self._n_timed if self._n_timed else math.inf
+        while self._joins and self._waiting and not attempts:
+            more, lost = self._waiting[0]
+            if lost or (len(batch) + len(more)) * each > _SECONDS or _level(more[0]) != _level(batch[0]):
+                break
+            batch += self._waiting.popleft()[0]
+        return batch, attempts
+
     def _hand_out(self, executor: Executor, batch: tuple[Key, ...], attempts: int) -> None:
         """Submit a batch, without rows that another process has kept meanwhile."""
         finished = self._store.finished(batch)
@@ -148,13 +182,15 @@ class _Run:
             self._note(finished)
         left = tuple(key for key in batch if key not in finished)
         if left:
-            self._running[executor.submit(self._compute, left)] = left, attempts
+            self._running[executor.submit(_timed, self._compute, left)] = left, attempts
 
     def _keep(self, batch: tuple[Key, ...], attempts: int, future: Future[Any]) -> None:
         """Keep the rows of a batch, or queue it again if its worker was lost."""
         error = CancelledError("the executor cancelled it") if future.cancelled() else future.exception()
         if error is None:
-            self._store.add(future.result())
+            rows, seconds = future.result()
+            self._seconds, self._n_timed = self._seconds + seconds, self._n_timed + len(batch)
+            self._store.add(rows)
             self._note(batch)
             return
         if isinstance(error, StudyError):  # the worker is alive and would fail again

@@ -48,7 +48,7 @@ def identify_each(
     configuration: Mapping[str, Any] | None = None,
     executor: Executor | None = None,
     jobs: int | None = None,
-    batch_size: int = 4,
+    batch_size: int | None = None,
     tasks: int | None = None,
     time_limit: float | None = None,
     progress: Progress | None = None,
@@ -77,7 +77,7 @@ def identify_each(
     executor, jobs, tasks, time_limit, progress
         As in `run_study`.
     batch_size : int, optional
-        Logs that a worker identifies before it hands over rows.
+        Logs that a worker identifies before it hands over rows; None: four, or as many as take about a second.
     **arguments
         Of `identify`, such as ``seed`` and ``differentiate``.
 
