@@ -1,5 +1,7 @@
 """The package as a whole: what it exports, what it costs to import, who may import whom."""
 
+import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -51,6 +53,19 @@ def test_every_exported_name_exists_and_nothing_else_is_public():
 
 def test_names_that_are_imported_when_asked_for_are_exported():
     assert set(diransac._LATER) <= set(diransac.__all__)
+
+
+PACKAGES = sorted((REPOSITORY / "src/diransac").rglob("__init__.py"))
+
+
+@pytest.mark.parametrize("file", PACKAGES, ids=lambda file: file.parent.name)
+def test_the_docstring_of_a_package_lists_its_files(file: Path):
+    """But for those in a registry below it, such as ``"npz:read_npz"``."""
+    text = file.read_text()
+    listed = {*re.findall(r"`(\w+)(?:\.py|/)?`", ast.get_docstring(ast.parse(text))), *re.findall(r'"(\w+):', text)}
+    packages = {path.parent.name for path in file.parent.glob("*/__init__.py")}
+    files = {path.stem for path in file.parent.glob("[!_]*.py")} if file.parent.name != "diransac" else set()
+    assert not (packages | files) - listed
 
 
 @pytest.mark.parametrize("name", diransac.__all__)

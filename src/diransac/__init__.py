@@ -2,6 +2,9 @@
 
 ``import diransac as dr``: `identify` estimates the parameters of a `Model` from a `Log` and returns a `Result`.  Models
 and errors are imported with the package, everything else on first access.
+
+Packages, each with a docstring to begin with: `model` and `data` (equations; logs), `simulation`, `identification`,
+`flight`, `study`, and what shows their results, `export`, `plots`, `report`, `cli` and `studio`.
 """
 
 import importlib

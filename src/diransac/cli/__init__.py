@@ -1,4 +1,16 @@
-"""The command line: parse, call, print."""
+"""The command line: parse, call, print.
+
+In come words; out come lines, files and an exit code.  Begin with `commands/`, which has the commands by subject.
+
+| file | contents |
+|---|---|
+| `commands/` | the commands |
+| `options.py`, `robot_options.py`, `flight_options.py` | options that several commands share |
+| `arguments.py` | models, methods and settings from text |
+| `screen.py`, `outputs.py` | what is printed; files that are written |
+| `rows.py`, `tracking.py` | work that is kept as rows of a store; the tracker over a file |
+| `attached.py` | the command line for as long as another process lives |
+"""
 
 import gc
 import os

@@ -15,7 +15,6 @@ from diransac.errors import LogError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from diransac.data.log import Log
     from diransac.model import Model
 
 ROUNDING = 1e-6
@@ -113,10 +112,10 @@ def _abbreviates(short: str, name: str) -> bool:
     return begins and len(words[-1]) >= _SHORTEST_ABBREVIATION
 
 
-def other_spelling(name: str, log: Log, model: Model) -> str | None:
+def other_spelling(name: str, signals: Iterable[str], model: Model) -> str | None:
     """Signal of a log that its model does not have and that is likely to be the named one; None without one."""
     known = {*model.signals, *model.inputs}
-    return alike(name, [x for x in log.names if x not in known])
+    return alike(name, [x for x in signals if x not in known])
 
 
 def _letters_and_digits(name: str) -> tuple[str, str]:

@@ -312,7 +312,7 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
     if name in log.unusable:
         raise LogError(f'{log.source}: signal "{name}" {log.unusable[name]}; correct the column, or {hint}')
     absent = dict.fromkeys(n for n in (name, *model.inputs, *model.coordinates) if n not in log)
-    pairs = [f"{n}={near}" for n in absent if (near := other_spelling(n, log, model)) is not None]
+    pairs = [f"{n}={near}" for n in absent if (near := other_spelling(n, log.names, model)) is not None]
     found, also = ", ".join(("t", *log.names)), f"; by their names, --map {','.join(pairs)}" if pairs else ""
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}{also}.')
 
@@ -322,7 +322,7 @@ def _check_spelling(model: Model, log: Log) -> None:
     steps = [step.get("signals") for step in log.history if step.get("step") == "unmeasured"]
     stated = [name for names in steps if isinstance(names, list) for name in names]
     for name in model.coordinates:
-        near = None if name in log or name in stated else other_spelling(name, log, model)
+        near = None if name in log or name in stated else other_spelling(name, log.names, model)
         if near is not None:
             raise LogError(
                 f'{log.source}: "{name}" is not in it, but "{near}" is, which the model has not. If it is the same, '
@@ -332,7 +332,7 @@ def _check_spelling(model: Model, log: Log) -> None:
 
 def spelling_notes(model: Model, log: Log, names: Sequence[str]) -> list[str]:
     """Notes on signals and inputs of these names that the log lacks, and seems to have under another spelling."""
-    found = {name: other_spelling(name, log, model) for name in names if name not in log}
+    found = {name: other_spelling(name, log.names, model) for name in names if name not in log}
     return [f'"{near}" is not used; if it is {name}, pass --map {name}={near}' for name, near in found.items() if near]
 
 

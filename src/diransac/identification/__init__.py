@@ -1,6 +1,19 @@
 """Identification: dataset -> method -> estimate -> evaluation, and the results that users see.
 
-`identify` takes a model and logs and returns a `Result`.  It binds them (`Dataset`), lets a `Method` fit an `Estimate`
-with its `Diagnosis`, and evaluates that.  Rooms, from below: `regression`, `structure`, `evaluation`, `methods`,
-`assessment`.  Begin with `identify`.
+In come a model and logs; out comes a `Result`.  Begin with `identify.py`, which binds them (`Dataset`), lets a `Method`
+fit an `Estimate` with its `Diagnosis`, and evaluates that.
+
+| file | contents |
+|---|---|
+| `identify.py` | `identify` |
+| `method.py`, `settings.py` | the protocol of a method; `Settings` |
+| `estimate.py`, `diagnosis.py`, `finding.py` | what a method returns: parameters; noise and forces; sentences |
+| `result.py`, `result_text.py`, `result_files.py` | `Result`; as text; as files |
+| `serialization.py` | JSON of dataclasses by their annotations |
+| `regression/` | parameters from rows of equations |
+| `structure/` | what a model and a log determine; terms that a model may lack |
+| `evaluation/` | an estimate against its logs; findings |
+| `methods/` | the methods |
+| `assessment/` | inspection of logs, validation of models |
+| `tracking/` | parameters of a machine while it runs |
 """

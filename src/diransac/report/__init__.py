@@ -1,4 +1,18 @@
-"""Self-contained HTML page of identification results: parameters, verdict, figures, provenance."""
+"""Self-contained HTML page of identification results: parameters, verdict, figures, provenance.
+
+In come results with their logs, a history of a tracker, or a store; out comes one file without references to others.
+Begin with `write_report`.
+
+| file | contents |
+|---|---|
+| `runs.py` | results simulated over the logs: the numbers behind every section |
+| `sections.py`, `provenance.py` | tables and texts; equations, settings and versions |
+| `figures.py` | geometry of SVG figures |
+| `over_time.py`, `friction.py` | signals, residuals and forces over time; friction over speed |
+| `tracking.py`, `stores.py` | pages of tracked runs, and of studies and fleets |
+| `rendering.py`, `templates/` | Jinja templates |
+| `viewer.py` | recordings for the Rerun viewer |
+"""
 
 from __future__ import annotations
 

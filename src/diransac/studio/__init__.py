@@ -1,4 +1,16 @@
-"""A page on this machine from logs to a calibrated model: a face of the command line, which it runs."""
+"""A page on this machine from logs to a calibrated model: a face of the command line, which it runs.
+
+In come folders; out comes what commands write there, and a project file.  Begin with `app.py`.
+
+| file | contents |
+|---|---|
+| `app.py`, `guard.py` | the ASGI application; what a request must pass before it |
+| `project.py`, `stages.py` | `Project`, and the commands of its stages |
+| `jobs.py` | commands that run |
+| `folders.py` | files that the page may see |
+| `series.py`, `scene.py` | logs, and the machine in three dimensions, as the page draws them |
+| `static/` | the page |
+"""
 
 from __future__ import annotations
 

@@ -8,24 +8,10 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from diransac.data.readers import ENDINGS
 from diransac.errors import LogError, ModelError
 from diransac.limits import LARGEST_TABLE, read_bytes
 
-_LOGS = (
-    ".csv",
-    ".csv.gz",
-    ".tsv",
-    ".txt",
-    ".parquet",
-    ".npz",
-    ".mat",
-    ".h5",
-    ".hdf5",
-    ".ulg",
-    ".ulog",
-    ".mcap",
-    ".bag",
-)
 MODELS = (".urdf", ".mjcf", ".xml", ".py", ".json")
 _MOST, _DEEPEST = 2000, 5
 
@@ -132,8 +118,8 @@ class Folders:
                 folders[:] = [] if deep else sorted(x for x in folders if x[0] != "." and x != "__pycache__")
                 for name in sorted(files):
                     path, lower = folder / name, name.lower()
-                    if lower.endswith((*_LOGS, *MODELS)) and self._is_inside(path):
-                        yield path, lower.endswith(_LOGS)
+                    if lower.endswith((*ENDINGS, *MODELS)) and self._is_inside(path):
+                        yield path, lower.endswith(ENDINGS)
 
     def _is_inside(self, path: Path) -> bool:
         real = Path(os.path.realpath(path))

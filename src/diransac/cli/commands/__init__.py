@@ -1,4 +1,13 @@
-"""The command line; commands on one subject are a module of this package. Exit codes and messages of all."""
+"""The command line; commands on one subject are a module of this package. Exit codes and messages of all.
+
+| file | commands |
+|---|---|
+| `identification.py` | ``identify``, ``compare``, ``cross-validate`` |
+| `inspection.py` | ``inspect``, ``map``, ``models``, ``cache`` |
+| `results.py` | ``validate``, ``predict``, ``view``, ``export`` |
+| `design.py`, `flight.py` | ``design``; ``simulate``, ``fly`` |
+| `stores.py`, `tracking.py`, `studio.py` | ``study``, ``fleet``; ``track``; ``studio`` |
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,13 @@
 """Preparation of a log in explicit steps: functions from a `Log` to a new `Log`.
 
 Each step adds one mapping to ``Log.history`` and, where it changes samples, a sentence to ``Log.notes``.
+
+| file | contents |
+|---|---|
+| `steps.py` | names, factors, rates, delays |
+| `differentiation.py` | velocities and accelerations, and rows filtered against their noise |
+| `spikes.py` | `despike`, by running medians |
+| `continuity.py` | angles without wraps, quaternions without changes of sign |
 """
 
 from diransac.data.preprocessing.continuity import continuous, continuous_quaternions, unwrap

@@ -208,7 +208,7 @@ def _underivable(log: Log, model: Model, name: str, source: str | None) -> str:
     if source is None:
         why = f'model "{model.name}" has velocities that are not derivatives of its coordinates'
         return f'{log.source}: signal "{name}" is missing and cannot be derived: {why}; found {found}. Give it.'
-    give = f"Give either, as in --map {source}={other_spelling(source, log, model) or 'COLUMN'}."
+    give = f"Give either, as in --map {source}={other_spelling(source, log.names, model) or 'COLUMN'}."
     return f'{log.source}: signal "{name}" is missing, and so is "{source}", its source; found {found}. {give}'
 
 

@@ -1,4 +1,18 @@
-"""Readers of logs: one module per format, imported at its first use, and `read_log` for all formats."""
+"""Readers of logs: one module per format, imported at its first use, and `read_log` for all formats.
+
+In comes a path; out comes a `Log`.  A module of a format returns a `Table` or a `Recording`, which `reading.py` makes a
+log of.  Begin with `npz.py`, a short one.
+
+| file | contents |
+|---|---|
+| `comma_separated.py`, `npz.py`, `parquet.py`, `mat.py`, `hdf5.py` | formats with one table |
+| `ulog.py`, `bags.py`, `crazyflie.py` | formats with topics |
+| `lerobot.py` | a folder of episodes |
+| `table.py` | `Table`, and what readers of tables share |
+| `recording.py`, `topics.py` | `Recording`, topics with clocks of their own; their one table |
+| `reading.py`, `repair.py` | `Reading`: from contents to a log; repairs of faults |
+| `growing.py` | files that grow while they are read |
+"""
 
 from __future__ import annotations
 
@@ -24,7 +38,7 @@ if TYPE_CHECKING:
     from diransac.data.readers.recording import Recording
     from diransac.data.readers.topics import TopicTable
 
-__all__ = ["episodes_of", "read_fields", "read_log", "read_logs", "read_topics"]
+__all__ = ["ENDINGS", "episodes_of", "read_fields", "read_log", "read_logs", "read_topics"]
 
 _TABLES = {
     ".parquet": "parquet:read_parquet",
@@ -57,7 +71,8 @@ _REMEDIES = {
 }
 """Endings that are not read -> what to do."""
 
-_ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
+ENDINGS = (*_TEXTS, *_TABLES, *_RECORDINGS)
+"""Endings of files that are read, lower case; some files have none, and some logs are folders."""
 
 
 def read_log(
@@ -269,7 +284,7 @@ def _opened(path: Path, source: str, columns: Sequence[str] | None, repairs: Rep
     if is_crazyflie:
         return CrazyflieRecording(_content(path, source), source)
     remedy = "".join(f"; {what}" for endings, what in _REMEDIES.items() if path.suffix.lower() in endings.split())
-    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(_ENDINGS)}{remedy}')
+    raise LogError(f'{source}: the ending "{path.suffix}" is not known; use one of {", ".join(ENDINGS)}{remedy}')
 
 
 def _described(path: Path, read: Table | Recording, source: str) -> Table | Recording:
@@ -289,7 +304,7 @@ def _imported(place: str) -> Callable[..., Table | Recording]:
 
 def _ending(path: Path) -> str | None:
     """The longest known ending of a file's name; None where it has none."""
-    return max((x for x in _ENDINGS if path.name.lower().endswith(x)), key=len, default=None)
+    return max((x for x in ENDINGS if path.name.lower().endswith(x)), key=len, default=None)
 
 
 def _is_bag(folder: Path) -> bool:

@@ -1,6 +1,12 @@
 """Identification methods, each a frozen object with its own settings; `METHODS` names them.
 
 A new method is a file here and a line in the registry: its name, and the function that returns it from `Settings`.
+
+| file | methods |
+|---|---|
+| `least_squares.py` | ols, tls, nls |
+| `ransac.py`, `samples.py` | diransac, i-diransac; their hypotheses |
+| `lo_diransac/` | lo-diransac, the default |
 """
 
 from __future__ import annotations

@@ -1,6 +1,13 @@
 """Structure: what a model and a log can determine, and what is wrong with either.
 
-In: a model, a dataset or its rows of motions.  Out: ambiguous parameters in words (`structural` of equations,
-`identifiability` of logs), parameters that are known beforehand, causes of refusals, mistakes of columns, and terms
-that a model may lack: candidates, and sentences about those that are found.  Begin with `identifiability`.
+In: a model, a dataset or its rows of motions.  Out: sentences, candidate terms, refusals.  Begin with
+`identifiability.py`.
+
+| file | contents |
+|---|---|
+| `structural.py`, `identifiability.py` | ambiguous parameters: of equations, of logs |
+| `equivalents.py` | other parameters with the same transfer function |
+| `known_parameters.py` | fixed parameters and priors |
+| `refusal.py`, `columns.py` | causes of refusals; units and signs of columns |
+| `candidate_terms.py`, `lacking_terms.py` | terms that a model may lack; those that are found, in words |
 """

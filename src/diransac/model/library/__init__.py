@@ -1,4 +1,12 @@
-"""Built-in models, `robot` for models from description files, and `builtin`, which returns a model by name."""
+"""Built-in models, `robot` for models from description files, and `builtin`, which returns a model by name.
+
+| file | models |
+|---|---|
+| `drives.py` | servo axis, direct-current motor, flexible joint |
+| `pendulums.py` | cart-pole, double pendulum |
+| `rotorcraft.py`, `quadrotor.py` | planar rotorcraft, with and without effects of its rotors; multirotors |
+| `vehicles.py` | underwater vehicle, single-track car, differential drive |
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,15 @@
-"""Models of robots from their description files."""
+"""Models of robots from their description files.
+
+In comes an MJCF or URDF file; out comes a `Model` with equations, and after identification the file with other values.
+Begin with `robot.py`.
+
+| file | contents |
+|---|---|
+| `robot.py` | `robot` |
+| `description.py`, `sizes.py` | bodies and joints of a file, read by MuJoCo; limits of its size |
+| `rigid_body.py`, `mechanism.py`, `actuation.py` | inverse dynamics; forces of joints; forces of drives |
+| `calibration.py`, `consistency.py` | estimates in the file; possible bodies for base parameters |
+"""
 
 from diransac.model.robots.actuation import Actuation, JointTorques, MotorCurrents, PositionControl, drive_forces
 from diransac.model.robots.robot import body_position, coordinates_of_bodies, robot, robot_limits

@@ -10,6 +10,7 @@
 | `code_cache.py` | machine code on disk |
 | `functions.py` | `Map` and `Scan`: SX functions over arrays |
 | `time_loop.py` | the time loop of a simulation, and the sources of its inputs |
+| `stage_function.py` | dynamics of a stage as one function, which every stage calls |
 | `sensitivities.py` | derivatives of the state in the time loop: columns in memory, stepped in loops |
 | `outputs.py` | outputs of the time loop: scores, sums, series |
 | `lanes.py` | arrays of many rollouts, arranged for the time loop |

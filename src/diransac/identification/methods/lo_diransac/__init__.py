@@ -1,22 +1,38 @@
 """The method lo-diransac: random minimal samples, consensus by simulation, local optimisation.
 
+In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with `method.py`.
+
 | file | content |
 |---|---|
-| `settings.py` | settings, checked |
-| `method.py` | `LoDiransac`: the steps in their order |
-| `smoothing.py` | screening of samples, and the motion without a model |
-| `hypotheses.py` | samples in weak form, consensus |
-| `without_equations.py`, `following.py`, `prediction_error.py` | estimates of models that a simulator alone knows |
-| `augmented_model.py` | the model with discrepancies |
+| `method.py`, `settings.py` | `LoDiransac`: the steps in their order; settings, checked |
+| **the logs** | |
+| `preparation.py`, `screening.py` | logs in intervals; samples and inputs that are left out |
+| `smoothing.py`, `unmeasured.py` | the motion without a model; states that no signal measures |
 | `shooting.py` | logs as intervals, each a rollout of the augmented model |
-| `mixture.py` | noise: a Gaussian and outliers |
-| `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
-| `refinement.py`, `gauss_newton.py` | local optimisation, from easy to exact, and its steps |
+| `augmented_model.py`, `corrections.py` | the model with discrepancies; errors of sensors and inputs, `ErrorKind` |
+| **the search** | |
+| `search.py`, `hypotheses.py` | the likeliest explanation; samples in weak form, consensus |
 | `local_search.py` | explanations of a log, of which the likeliest is chosen |
-| `recording_errors.py` | delays and biases of sensors, delays of inputs, gains that drift |
-| `projection.py` | parameters and covariance |
-| `checks.py` | findings of a fit on itself |
+| **the fit** | |
+| `refinement.py`, `gauss_newton.py` | local optimisation, from easy to exact, and its steps |
+| `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
+| `mixture.py`, `scales.py` | noise: a Gaussian and outliers; scales of unmodelled accelerations |
+| `boundary.py` | knowledge from before a window |
+| `integration_steps.py` | as few integration steps as leave the fit |
+| **errors of recordings** | |
+| `recording_errors.py`, `joint_equations.py` | delays, biases, lags, drifts: their search, and as unknowns of a fit |
+| `score_tests.py` | tests of effects that are not in a fit |
+| **parameters and findings** | |
+| `projection.py`, `interval_effects.py` | parameters and covariance; effects of each interval |
+| `motion_equations.py` | residuals and regressors on the motion |
+| `diagnosing.py`, `checks.py` | the diagnosis by name; findings of a fit on itself |
+| `parts.py`, `logs_alone.py` | parameters of parts of the logs, and of each log |
 | `missing_terms.py`, `term_regression.py`, `term_evidence.py` | terms that the model may lack, and their weights |
+| **comparison with other estimates** | |
+| `competition.py`, `sources.py`, `arbiter.py` | estimates by other means, and their predictions of held-out blocks |
+| `simulation_error.py`, `segments.py` | one of them: simulation error of segments |
+| **models without equations** | |
+| `without_equations.py`, `prediction_error.py`, `following.py` | estimates of models that a simulator alone knows |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

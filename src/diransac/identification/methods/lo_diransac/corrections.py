@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
