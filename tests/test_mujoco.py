@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,10 @@ import pytest
 import diransac as dr
 from command_line import run
 from diransac.errors import ModelError, ResultError
-from diransac.model.mjcf import MujocoModel
+from diransac.identification.methods.lo_diransac import without_equations
+from diransac.identification.methods.lo_diransac.following import Predictor
+from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised
+from diransac.model.mjcf import MujocoModel, calibrated_text
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 mujoco = pytest.importorskip("mujoco", reason="MODELS OF MUJOCO NOT CHECKED: mujoco is missing")
@@ -258,29 +262,84 @@ def test_a_base_that_nothing_measures_is_followed(hopper_file: Path) -> None:
     assert result.parameters["body/payload.ipos[0]"] == pytest.approx(0.04, abs=0.005)
 
 
-CART = """<mujoco><option timestep="0.002"/><worldbody><body name="cart">
-    <joint name="x" type="slide" axis="1 0 0" damping="{d}"/>
-    <inertial pos="0 0 0" mass="{m}" diaginertia="1 1 1"/></body>
-  </worldbody><actuator><motor name="push" joint="x"/></actuator></mujoco>"""
+CART = """<body name="cart{k}"><joint name="x{k}" type="slide" axis="1 0 0" damping="{d}"/>
+    <inertial pos="0 0 0" mass="{m}" diaginertia="1 1 1"/></body>"""
+
+
+def carts(*masses: float, damping: float, drive: str = "motor") -> str:
+    """MJCF of carts on rails, each with a drive."""
+    bodies = "".join(CART.format(k=k, m=m, d=damping) for k, m in enumerate(masses))
+    drives = "".join(f'<{drive} name="push{k}" joint="x{k}"/>' for k in range(len(masses)))
+    return f'<mujoco><option timestep="0.002"/><worldbody>{bodies}</worldbody><actuator>{drives}</actuator></mujoco>'
+
+
+def log_of_carts(text: str, u: Any, seed: int, late: int = 0) -> dr.Log:
+    """Log of carts that have one input, which is recorded so many samples late."""
+    machine = mujoco.MjModel.from_xml_string(text)
+    data, n = mujoco.MjData(machine), machine.nq
+    motion = np.empty((len(u), 2 * n))
+    for k, value in enumerate(u):
+        motion[k] = *data.qpos, *data.qvel
+        data.ctrl[:] = value
+        mujoco.mj_step(machine, data)
+    motion += np.random.default_rng(seed).normal(size=motion.shape) * np.repeat([1e-4, 1e-3], n)
+    columns = {f"x{k}": motion[:, k] for k in range(n)} | {f"x{k}_dot": motion[:, n + k] for k in range(n)}
+    return dr.Log.from_arrays(0.002 * np.arange(len(u)), columns | {f"push{k}": np.roll(u, late) for k in range(n)})
+
+
+TIME = 0.002 * np.arange(1000)
 
 
 @pytest.mark.parametrize(("mass", "late"), [(30.0, 0), (0.5, -3)])
 def test_a_file_that_is_far_off_does_not_lose_the_motion(tmp_path: Path, mass: float, late: int) -> None:
-    machine = mujoco.MjModel.from_xml_string(CART.format(m=1.0, d=2.0))
-    data, rng, time = mujoco.MjData(machine), np.random.default_rng(0), 0.002 * np.arange(1000)
-    force, motion = 20.0 * np.sin(6.0 * time) + 15.0 * np.sin(23.0 * time), np.empty((1000, 2))
-    for k, u in enumerate(force):
-        motion[k] = data.qpos[0], data.qvel[0]
-        data.ctrl[0] = u
-        mujoco.mj_step(machine, data)
-    motion += rng.normal(size=motion.shape) * [1e-4, 1e-3]
-    (tmp_path / "cart.xml").write_text(CART.format(m=mass, d=0.1))
-    log = dr.Log.from_arrays(time, {"x": motion[:, 0], "x_dot": motion[:, 1], "push": np.roll(force, late)})
-    model = dr.models.mujoco(tmp_path / "cart.xml", unknown=["body/cart.mass", "joint/x.damping"])
+    u = 20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME)
+    log = log_of_carts(carts(1.0, damping=2.0), u, 0, late)
+    (tmp_path / "carts.xml").write_text(carts(mass, damping=0.1))
+    model = dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass", "joint/x*.damping"])
     result = dr.identify(model, log)
-    assert dict(result.parameters) == pytest.approx({"body/cart.mass": 1.0, "joint/x.damping": 2.0}, rel=1e-3)
+    assert dict(result.parameters) == pytest.approx({"body/cart0.mass": 1.0, "joint/x*.damping": 2.0}, rel=1e-3)
     assert result.estimate.resolution.timing.delay == pytest.approx(-0.002 * late, abs=5e-5)
     assert str(result.verdict) == ("usable with care" if late else "usable")
+
+
+@pytest.mark.parametrize(("failing", "lacks", "outliers"), [(1, 0.5, 0.1), (1, 0.0, 0.9), (9, 0.5, 0.1)])
+def test_a_fit_that_does_not_follow_the_motion_begins_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int, lacks: float, outliers: float
+) -> None:
+    starts = list[Any]()
+
+    def fitted(predictor: Predictor, start: Any, **options: Any) -> Minimum:
+        starts.append(start)
+        found = minimised(predictor, start, **options)
+        if len(starts) > failing:
+            return found
+        noise = replace(found.predictor.noise, pi=np.full(len(found.predictor.noise.pi), outliers))
+        last = replace(found.last, losses=found.last.losses + 1.0)
+        return replace(found, predictor=replace(found.predictor, lacks=lacks, noise=noise), last=last)
+
+    monkeypatch.setattr(without_equations, "minimised", fitted)
+    u = (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400]
+    log = log_of_carts(carts(1.0, damping=2.0), u, 0)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
+    model = dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"])
+    result = dr.identify(model, log)
+    assert len(set(np.ravel(starts))) == len(starts) == min(failing + 1, 4)
+    assert ("lacks 50 % of each change of velocity" in str(result)) == (failing == 9)
+    assert (str(result.verdict) == "do not rely on this") == (failing == 9)
+
+
+def test_parameters_are_those_without_a_delay_that_is_not_significant(tmp_path: Path) -> None:
+    drive = 'position kp="200" kv="10"'
+    u = 0.2 * np.sin(6.0 * TIME) + 0.1 * np.sin(13.0 * TIME)
+    log = log_of_carts(carts(1.0, damping=2.0, drive=drive), u, 1)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=1.0, drive=drive))
+    model = dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass", "joint/x0.damping"])
+    result, known = (dr.identify(model, log, method=dr.LoDiransac(input_delay=x)) for x in (None, False))
+    assert result.diagnosis is not None
+    assert abs(result.diagnosis.input_delay) > result.diagnosis.input_delay_error
+    for name, value in known.parameters.items():
+        assert abs(result.parameters[name] - value) < 0.2 * known.standard_errors[name]
+        assert result.standard_errors[name] > known.standard_errors[name]
 
 
 @pytest.mark.parametrize(
@@ -324,6 +383,18 @@ def test_results_and_descriptions_are_written_and_read(
     dr.write_report(result, log, tmp_path / "a.html")
     assert "MuJoCo" in (tmp_path / "a.html").read_text()
     assert set(result.sample(5)) == set(model.parameters)
+
+
+def test_an_inertia_that_is_impossible_by_its_errors_is_the_nearest_possible_one(tmp_path: Path) -> None:
+    path = tmp_path / "carts.xml"
+    path.write_text(carts(1.0, damping=2.0))
+    model = dr.models.mujoco(path, unknown=["body/cart0.inertia"])
+    estimates = dict(zip(model.parameters, (1.0, 1.0, 2.05), strict=True))
+    path.write_text(calibrated_text(path, model, estimates, 0.05**2 * np.eye(3))[0])
+    found = mujoco.MjModel.from_xml_path(str(path)).body_inertia[1]  # the compiler refuses impossible ones
+    assert np.abs(found - [1.0, 1.0, 2.05]).max() < 0.1
+    with pytest.raises(ModelError, match="impossible inertia"):
+        calibrated_text(path, model, estimates, 1e-6 * np.eye(3))
 
 
 @pytest.mark.parametrize("inside", ['<asset><mesh file="/etc/passwd"/></asset>', '<include file="a.xml"/>'])

@@ -202,7 +202,8 @@ def _calibrated(result: Result, into: str | Path, values: FloatArray) -> tuple[s
 
     model = result.model
     if isinstance(model, MujocoModel):
-        return calibrated_text(into, model, dict(zip(model.parameters, values.tolist(), strict=True)))
+        named = dict(zip(model.parameters, values.tolist(), strict=True))
+        return calibrated_text(into, model, named, result.covariance)
     return calibrated(into, model.parameters, values, result.covariance)
 
 

@@ -9,19 +9,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.errors import ModelError
-from diransac.model.mjcf.masks import FIELDS
+from diransac.model.mjcf.masks import FIELDS, Place
 from diransac.model.mjcf.model import write
 from diransac.model.robots.calibration import Document, numbers
+from diransac.model.robots.consistency import consistent_parameters
 from diransac.model.robots.sizes import check_description
 
 if TYPE_CHECKING:
     from diransac.model.mjcf.masks import Unknown
     from diransac.model.mjcf.model import MujocoModel
 
+_FAR, _FIXED = 3.0, 1e-3
+"""Change to a possible inertia that errors explain, standard errors; change of a given one, of its size."""
 
-def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+
+def calibrated_text(
+    path: str | Path, model: MujocoModel, values: Mapping[str, float], covariance: FloatArray
+) -> tuple[str, tuple[str, ...]]:
     """Text of an MJCF with estimates in it, and the parameters that are not in it.
+
+    Inertias that are impossible by their errors are the nearest possible ones (`consistent_parameters`).
 
     Parameters
     ----------
@@ -30,6 +39,7 @@ def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, f
     model : MujocoModel
     values : mapping of str to float
         Estimate of each parameter; NaN where there is none.
+    covariance : (n_p, n_p) array
 
     Returns
     -------
@@ -41,7 +51,8 @@ def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, f
     Raises
     ------
     ModelError
-        The file cannot be read, is a URDF, or has an element in another file.
+        The file cannot be read, is a URDF, or has an element in another file; an inertia is impossible beyond its
+        errors.
     """
     label = f'robot description "{path}"'
     if not Path(path).is_file():
@@ -54,6 +65,8 @@ def calibrated_text(path: str | Path, model: MujocoModel, values: Mapping[str, f
     for unknown in model.unknowns:
         if np.isfinite(values[unknown.name]):
             write(compiled, unknown.places, values[unknown.name])
+    for body in {x.index[0] for unknown in model.unknowns for x in unknown.places if x.array == "body_inertia"}:
+        compiled.body_inertia[body] = _possible_inertia(model, compiled, body, covariance)
     for unknown in model.unknowns:
         if not unknown.places or not np.isfinite(values[unknown.name]):
             left_out.append(unknown.name)
@@ -90,12 +103,26 @@ def _belongs(compiled: Any, kind: str, array: str, row: int, index: int) -> bool
     return bool(compiled.jnt_qposadr[index] == row if joints is None else joints[row] == index)
 
 
+def _possible_inertia(model: MujocoModel, compiled: Any, body: int, covariance: FloatArray) -> FloatArray:
+    """Principal inertias ``(3,)`` of a body, kg m^2, moved by their errors to where the triangle inequality holds."""
+    inertia: FloatArray = compiled.body_inertia[body].copy()
+    if (inertia.sum() - 2.0 * inertia >= -1e-9 * inertia.sum()).all():
+        return inertia
+    places = [Place("body_inertia", (body, axis)) for axis in range(3)]
+    entries = np.array([[x in unknown.places for unknown in model.unknowns] for x in places], float)
+    errors = entries @ np.where(np.isfinite(covariance), covariance, 0.0) @ entries.T
+    described = np.array([[compiled.body_mass[body], 0.0, 0.0, 0.0, *model.compiled.body_inertia[body], 0.0, 0.0, 0.0]])
+    found = consistent_parameters(described, np.zeros(0), np.eye(10)[4:7], inertia, errors)[0][0, 4:7]
+    if (np.abs(found - inertia) > _FAR * np.sqrt(np.diag(errors)) + _FIXED * inertia).any():
+        name = compiled.body(body).name
+        raise ModelError(f'body "{name}" would have the impossible inertia {numbers(inertia)}; fix one of its entries')
+    return found
+
+
 def _inertial(compiled: Any, name: str) -> str:
     """Element of a body with its mass and inertia."""
     body = compiled.body(name)
-    inertia = np.ravel(body.inertia)
-    if not (inertia.sum() - 2.0 * inertia >= -1e-9 * inertia.sum()).all():
-        raise ModelError(f'body "{name}" would have the impossible inertia {numbers(inertia)}; fix one of its entries')
     turned = not np.allclose(body.iquat, [1.0, 0.0, 0.0, 0.0])
     quat = f' quat="{numbers(body.iquat)}"' if turned else ""
-    return f'<inertial pos="{numbers(body.ipos)}"{quat} mass="{numbers(body.mass)}" diaginertia="{numbers(inertia)}"/>'
+    inertia = numbers(np.ravel(body.inertia))
+    return f'<inertial pos="{numbers(body.ipos)}"{quat} mass="{numbers(body.mass)}" diaginertia="{inertia}"/>'

@@ -160,7 +160,7 @@ class LoDiransac(LoDiransacSettings):
             The time limit was reached before the first local optimisation had converged.
         """
         if not dataset.model.has_equations:
-            return estimated_by_simulation(self, dataset, callback)
+            return estimated_by_simulation(self, dataset, seed, callback)
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
         with memory:
             return _fitted(self, dataset, int(seed), callback)

@@ -57,6 +57,16 @@ class Minimum:
     converged: bool
     covariance: FloatArray
 
+    def without_delay(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters ``(n_p,)`` that are likeliest where inputs act at once, and their covariance.
+
+        The change by a delay that is not significant counts as an error.
+        """
+        C, bounds = self.covariance, _bounds_of_step(self.predictor, self.parameters, held=True)
+        slope = np.divide(C[:-1, -1], C[-1, -1], out=np.zeros(len(C) - 1), where=C[-1, -1] > 0.0)
+        moved = np.clip(-slope * self.predictor.delay, *(x[:-1] for x in bounds))
+        return self.parameters + moved, C[:-1, :-1] - np.outer(slope, C[-1, :-1]) + np.outer(moved, moved)
+
 
 def minimised(
     predictor: Predictor,

@@ -39,13 +39,15 @@ _USED = (
     "input_delay", "start",
 )  # fmt: skip
 """Settings that are used without equations."""
+_LACKING, _MORE_STARTS = 0.1, 3
+"""Part of each change of velocity that a model lacks where its motion is another one; starts from elsewhere then."""
 _LEAST_DELAY = 0.05
 """Delay, samples, that is none."""
 _OUTLIER, _GAUSSIAN = 0.5, 10_000
 
 
 def estimated_by_simulation(
-    settings: LoDiransacSettings, dataset: Dataset, callback: Callback | None = None
+    settings: LoDiransacSettings, dataset: Dataset, seed: int, callback: Callback | None = None
 ) -> Estimate:
     """Parameters of a model without equations from the logs.
 
@@ -53,6 +55,8 @@ def estimated_by_simulation(
     ----------
     settings : LoDiransacSettings
     dataset : Dataset
+    seed : int
+        Of further starts.
     callback : callable, optional
         Called with a `Progress` at every pass.
 
@@ -77,27 +81,46 @@ def estimated_by_simulation(
     begin = settings.start_of(dataset.layout)
     begin = np.ones(len(dataset.layout)) if begin is None else begin
     free = settings.input_delay is not False and bool(np.ptp(intervals.recorded, axis=0).any())
-    so_far = list[Minimum]()
+    so_far, ends = list[Minimum](), list[Minimum]()
 
     def progress(k: int, found: Minimum) -> None:
         so_far[:] = [found]
         text = f"pass {k + 1}: negative log-likelihood {found.last.losses.sum():.6g}"
-        report(callback, "prediction errors", min(0.05 + 0.05 * k, 0.85), text)
+        report(callback, "prediction errors", 0.85 if ends else min(0.05 + 0.05 * k, 0.85), text)
 
     predictor = Predictor.of(intervals, outliers=settings.outliers, free_delay=free)
     try:
-        found = minimised(predictor, begin, outliers=settings.outliers, progress=progress)
-        ended = "converged" if found.converged else "limit of passes"
+        for start in _starts(dataset, begin, seed):
+            ends.append(minimised(predictor, start, outliers=settings.outliers, progress=progress))
+            if _follows(ends[-1]):
+                break
     except TimeLimitError:
         if not so_far:
             raise
-        found, ended = so_far[0], TIME_LIMIT
+    found = min(ends or so_far, key=lambda end: float(end.last.losses.sum()))
+    ended = TIME_LIMIT if not ends else "converged" if found.converged else "limit of passes"
     if found.last.lost.sum() > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
             f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
             "start= or --start"
         )
     return _Found(settings, dataset, found, ended, notes).estimate()
+
+
+def _follows(end: Minimum) -> bool:
+    """True unless a fit lacks much of the motion, or takes most samples of a state for outliers."""
+    n_x = len(end.predictor.intervals.model.state)
+    return end.predictor.lacks <= _LACKING and bool((end.predictor.noise.pi[:n_x] <= _OUTLIER).all())
+
+
+def _starts(dataset: Dataset, begin: FloatArray, seed: int) -> Iterator[FloatArray]:
+    """Starts ``(n,)``: one that is given, and further ones whose positive parameters are up to three times as large."""
+    lower, upper = np.array([(x.lower, x.upper) for x in dataset.layout.bounds]).T
+    positive = np.array([x.positive for x in dataset.layout.bounds]) | (lower >= 0.0)
+    yield begin
+    for k in range(_MORE_STARTS):
+        factors = 3.0 ** np.random.default_rng([int(seed), k]).uniform(-1.0, 1.0, len(begin))
+        yield np.clip(np.where(positive, factors, 1.0) * begin, lower, upper)
 
 
 def _check_settings(settings: LoDiransacSettings) -> None:
@@ -181,15 +204,16 @@ class _Found:
     def estimate(self) -> Estimate:
         """The estimate."""
         dataset, n = self.dataset, len(self.found.parameters)
-        whole = self.found.covariance
-        covariance, lost = whole[:n, :n].copy(), self._lost(whole)
-        covariance[lost] = covariance[:, lost] = np.inf
-        names = dataset.layout.names
+        whole, names = self.found.covariance, dataset.layout.names
         delay_error = float(np.sqrt(whole[-1, -1])) if self.found.predictor.free_delay else np.inf
-        late = self._delay(delay_error)
+        late, lost = self._delay(delay_error), self._lost(whole)
+        values, covariance = self.found.parameters, whole[:n, :n].copy()
+        if self.found.predictor.free_delay and not late:
+            values, covariance = self.found.without_delay()
+        covariance[lost] = covariance[:, lost] = np.inf
         timing = InputTiming.of(np.full(dataset.model.n_u, late * dataset.dt), *np.zeros((2, dataset.model.n_u)))
         return Estimate(
-            parameters=dict(zip(names, self.found.parameters.tolist(), strict=True)),
+            parameters=dict(zip(names, values.tolist(), strict=True)),
             covariance=covariance,
             degrees_of_freedom=_GAUSSIAN,
             n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
@@ -202,10 +226,10 @@ class _Found:
         )
 
     def _delay(self, error: float) -> float:
-        """Delay of the inputs, samples; 0 where it is negligible, or not significant."""
+        """Delay of the inputs, samples; 0 where it is negligible, or not significant and less than a sample."""
         size = abs(self.found.predictor.delay)
         late = float(self.found.predictor.delay)
-        return late if size > max(_LEAST_DELAY, 3.0 * error) or self.settings.input_delay else 0.0
+        return late if size > max(_LEAST_DELAY, min(3.0 * error, 1.0)) or self.settings.input_delay else 0.0
 
     def _lost(self, covariance: FloatArray) -> BoolArray:
         """Parameters ``(n,)`` that the logs do not determine: nothing depends on them, or too little."""
@@ -224,6 +248,12 @@ class _Found:
                 "bad",
                 f"The inputs seem to act {1e3 * early * self.dataset.dt:.2g} ms before they are recorded",
                 "check their clock, begin closer, with start= or --start, or give input_delay=False",
+            )
+        if self.found.predictor.lacks > _LACKING:
+            yield Finding(
+                "bad",
+                f"The model lacks {100.0 * self.found.predictor.lacks:.0f} % of each change of velocity",
+                "begin closer, with start= or --start, or correct the file",
             )
         if self.ended not in ("converged", TIME_LIMIT):
             yield Finding(
