@@ -14,7 +14,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.tracking.estimates import Change
-from diransac.identification.tracking.forces import Forces, likeliest_forces, with_forces
+from diransac.identification.tracking.forces import Forces, with_forces
 from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
 from diransac.identification.tracking.stepped_fits import SteppedFit, SteppedFits
 from diransac.identification.tracking.window import AS_LIKELY
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 _MEMORY = 60.0
 # Ages that are tested at most: those of a window of 2^30 intervals.
 _MOST_AGES = 32
-# Time after which unmodelled accelerations that explain a window clearly better than any step are usual ones, s.
-_PATIENCE = 1.0
 # Standard deviations of the changes by a drift in a second, over the size of a parameter.
 _RATES = np.concatenate([[0.0], np.logspace(-6.0, -1.0, 16)])
 # Evidence, nats, from which on a parameter drifts, or a change counts that no force has been asked to explain.
@@ -284,7 +282,7 @@ class Changes:
 
     def _decide(self, window: Window, usual: Forces) -> None:
         """Release the parameters that have changed from then on, unless forces or a drift explain as much."""
-        fits = SteppedFits(window, self._kept)
+        fits = SteppedFits(window, usual, self._kept)
         calm = with_forces(fits.motion, usual)
         values, ages = window.fit.shared, self._ages(window, fine_ages_of)
         tests, scatter = change_tests(calm, ages), self._scatter(ages, len(window))
@@ -301,8 +299,7 @@ class Changes:
         exact = Forces(np.broadcast_to(window.least, window.fit.d.shape), none)
         if (usual.tau > window.expected).any() and fits.stepped(first, few, sizes, exact).evidence > step.evidence:
             step, forces = fits.nearby(first, few, sizes, exact), exact
-        age = len(window) - step.first
-        larger = likeliest_forces(calm, window.expected, window.largest, {len(window), age, min(age + 1, len(window))})
+        larger = fits.larger_since(len(window) - step.first)
         unchanged = {x: fits.unchanged(x) for x in (usual, forces, larger)}
         without = max(unchanged.values())
         if step.evidence < without:
@@ -317,7 +314,7 @@ class Changes:
         elif self._kept is not None and over_rivals < 0.0:
             window.begin_with(0, fits.stepped(0, few[:0], none[:0], larger).fit)
             self._pending, self._kept = [], None
-        elif over_rivals < -AS_LIKELY and self._firing * self.step > _PATIENCE:
+        elif over_rivals < -AS_LIKELY and self._firing > len(window):
             self._usual = np.stack([np.log(larger.tau[-1]), larger.rho])
 
     def _is_no_step(self, step: SteppedFit, after: Linearization) -> bool:

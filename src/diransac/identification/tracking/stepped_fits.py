@@ -19,13 +19,14 @@ from diransac.identification.methods.lo_diransac.gauss_newton import bounded, li
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import diverges, negative_log_evidence
+from diransac.identification.tracking.forces import Forces, likeliest, likeliest_forces, since, with_forces
+from diransac.identification.tracking.step_tests import ages_of
 from diransac.identification.tracking.surprise import followed, free_motion
 from diransac.identification.tracking.window import AS_LIKELY, Linearization
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.tracking.forces import Forces
     from diransac.identification.tracking.window import Window
 
 # Standard deviation of a time within an interval, over its duration.
@@ -79,31 +80,43 @@ class SteppedFits:
     Parameters
     ----------
     window : Window
+    usual : Forces
+        Unmodelled accelerations from before the window.
     boundary : BoundaryPrior, optional
         What is known from before the window; by default what its fit takes for that.
 
     Attributes
     ----------
+    larger : Forces
+        Likeliest ones.
     motion : Linearization
-        At the motion that follows the samples.
+        At the fit with these, from which all others start.
     """
 
-    def __init__(self, window: Window, boundary: BoundaryPrior | None = None) -> None:
-        self._window = window
+    def __init__(self, window: Window, usual: Forces, boundary: BoundaryPrior | None = None) -> None:
+        self._window, self._usual = window, usual
         intervals = window.intervals()
         fit = free_motion(window, intervals, len(window))
         known = NoiseSums.of(fit.residuals, intervals.known, fit.noise.inlying(fit.residuals, intervals.known))
         noise = fit.noise.of_sums(known.plus(window.memory.noise))
-        motion = {name: getattr(fit, name) for name in ("x", "d", "residuals", "ends")}
-        self._start = replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary, **motion)
-        self.motion = _linearization(intervals, self._start)
+        self._start = _moved(replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary), fit)
         self._fits_before: dict[tuple[int, Forces], _Before] = {}
+        calm = with_forces(_linearization(intervals, self._start), usual)
+        self.larger = likeliest_forces(calm, window.expected, window.largest, ages_of(len(window)))
+        fit, _ = followed(intervals, self._with(self.larger))
+        self._start = _moved(self._start, fit)
+        self.motion = _linearization(intervals, replace(self._start, tau=self.larger.tau, rho=self.larger.rho))
 
     def unchanged(self, forces: Forces) -> float:
         """Evidence, nats, of a window without a step, and with some unmodelled accelerations."""
         intervals = self.motion.intervals
-        fit, solved = followed(intervals, replace(self._start, tau=forces.tau, rho=forces.rho))
+        fit, solved = followed(intervals, self._with(forces))
         return -negative_log_evidence(intervals, fit, solved.log_det)
+
+    def larger_since(self, age: int) -> Forces:
+        """Likeliest unmodelled accelerations that may have become larger with a step, some intervals before the end."""
+        last = Forces(self.larger.tau[-1], self.larger.rho)
+        return likeliest(self.motion, [self.larger, *(since(self._usual, x, last) for x in (age, age + 1))])[0]
 
     def nearby(self, first: int, changed: IntArray, sizes: FloatArray, forces: Forces) -> SteppedFit:
         """Likeliest of the fits with a step at an interval, and before and after it as long as they become likelier.
@@ -217,8 +230,17 @@ class SteppedFits:
 
     def _part(self, intervals: slice, forces: Forces) -> Fit:
         """Motion of some intervals, with some unmodelled accelerations."""
-        whole = self._start
-        return replace(whole, x=whole.x[intervals], d=whole.d[intervals], tau=forces.tau[intervals], rho=forces.rho)
+        whole = self._with(forces)
+        return replace(whole, x=whole.x[intervals], d=whole.d[intervals], tau=forces.tau[intervals])
+
+    def _with(self, forces: Forces) -> Fit:
+        """Motion from which fits start, with some unmodelled accelerations."""
+        return replace(self._start, tau=forces.tau, rho=forces.rho)
+
+
+def _moved(fit: Fit, motion: Fit) -> Fit:
+    """A fit with the motion of another."""
+    return replace(fit, x=motion.x, d=motion.d, residuals=motion.residuals, ends=motion.ends)
 
 
 def _linearization(intervals: ShootingIntervals, fit: Fit) -> Linearization:
