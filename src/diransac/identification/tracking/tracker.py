@@ -18,7 +18,7 @@ from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
-from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, smoothed_motion
+from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
 from diransac.identification.tracking.stream import SensorWatch, Stream
 from diransac.model import Model
 from diransac.process import single_threaded
@@ -192,8 +192,9 @@ class Tracker:
             return
         parts = stream.parts
         try:
-            window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
-            window.optimise()
+            with np.errstate(over="ignore", invalid="ignore"):
+                window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
+                window.optimise()
         except DiransacError as error:  # too few samples as yet
             self._retry, self._refused = end + stream.length, str(error)
         except np.linalg.LinAlgError:
@@ -228,7 +229,11 @@ class Tracker:
                 window.join(states)
             else:
                 window.extend(n)
-            self._changes.after_step(window, window.optimise())
+            found = window.optimise()
+            if not window.memory.count and self._start is not None:
+                window.setup, window.fit = begun_anew(self._setup, window, self._start)
+                found = window.optimise()
+            self._changes.after_step(window, found)
         except np.linalg.LinAlgError:
             self._begin_anew()
         else:
