@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -83,7 +83,9 @@ def with_forces(found: Linearization, forces: Forces) -> Linearization:
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def likeliest_forces(found: Linearization, least: FloatArray, most: FloatArray, ages: Iterable[int]) -> Forces:
+def likeliest_forces(
+    found: Linearization, least: FloatArray, most: FloatArray, ages: Iterable[int]
+) -> Generator[None, None, Forces]:
     """Unmodelled accelerations that explain a linearised window best: its own, or larger ones, as a gust has.
 
     All become larger from a time on, and then each by itself, as long as the evidence grows.
@@ -98,16 +100,19 @@ def likeliest_forces(found: Linearization, least: FloatArray, most: FloatArray, 
 
     Returns
     -------
-    Forces
+    generator
+        Yields where it may be interrupted, and returns the accelerations.
     """
     usual = Forces(np.broadcast_to(found.fit.tau, found.fit.d.shape), found.fit.rho)
-    low = np.maximum(usual.tau, least)
+    low, rho = np.maximum(usual.tau, least), np.maximum(usual.rho, _GUST)
     sizes = [low * (np.maximum(most, low) / low) ** share for share in np.linspace(0.0, 1.0, _SIZES)]
-    trials = [usual, *(since(usual, age, Forces(tau, np.maximum(usual.rho, _GUST))) for age in ages for tau in sizes)]
-    best, evidence = likeliest(found, trials)
-    slower = Forces(best.tau, np.maximum(best.rho, _SLOW))
-    best, evidence = max((best, evidence), likeliest(found, [slower]), key=lambda x: x[1])
+    best = likeliest(found, [Forces(tau, rho) for tau in sizes])[0]
+    best = likeliest(found, [since(usual, age, best) for age in ages])[0]
+    now = np.any(best.tau > usual.tau, axis=1, keepdims=True)
+    trials = [usual, *(Forces(np.where(now, tau, usual.tau), rho) for tau in sizes)]
+    best, evidence = likeliest(found, [*trials, Forces(best.tau, np.maximum(rho, _SLOW))])
     for k in np.flatnonzero((low < most).any(axis=0)):
+        yield
         axis = np.arange(len(least)) == k
         of_axis = [usual.tau, *(np.where(best.tau > usual.tau, tau, usual.tau) for tau in sizes)]
         trials = [Forces(np.where(axis, tau, best.tau), best.rho) for tau in of_axis]

@@ -8,6 +8,7 @@ that the change has distorted tells how large it is, or what else it may be.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -80,32 +81,52 @@ class SteppedFits:
     Parameters
     ----------
     window : Window
-    usual : Forces
-        Unmodelled accelerations from before the window.
-    boundary : BoundaryPrior, optional
-        What is known from before the window; by default what its fit takes for that.
+    start : Fit
+        With the motion from which all fits start: that of the larger unmodelled accelerations.
+    usual, larger : Forces
+        Unmodelled accelerations from before the window, and the likeliest ones.
 
     Attributes
     ----------
-    larger : Forces
-        Likeliest ones.
     motion : Linearization
-        At the fit with these, from which all others start.
+        At this motion.
     """
 
-    def __init__(self, window: Window, usual: Forces, boundary: BoundaryPrior | None = None) -> None:
-        self._window, self._usual = window, usual
+    def __init__(self, window: Window, start: Fit, usual: Forces, larger: Forces) -> None:
+        self._window, self._start, self._usual, self.larger = window, start, usual, larger
+        self.motion = _linearization(window.intervals(), self._with(larger))
+        self._fits_before: dict[tuple[int, Forces], _Before] = {}
+
+    @classmethod
+    def of(cls, window: Window, usual: Forces, boundary: BoundaryPrior | None) -> Generator[None, None, SteppedFits]:
+        """Explanations of a window as it is now.
+
+        Parameters
+        ----------
+        window : Window
+            That does not move on.
+        usual : Forces
+            Unmodelled accelerations from before the window.
+        boundary : BoundaryPrior, optional
+            What is known from before the window; by default what its fit takes for that.
+
+        Returns
+        -------
+        generator
+            Yields where it may be interrupted, and returns them.
+        """
         intervals = window.intervals()
         fit = free_motion(window, intervals, len(window))
+        yield
         known = NoiseSums.of(fit.residuals, intervals.known, fit.noise.inlying(fit.residuals, intervals.known))
         noise = fit.noise.of_sums(known.plus(window.memory.noise))
-        self._start = _moved(replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary), fit)
-        self._fits_before: dict[tuple[int, Forces], _Before] = {}
-        calm = with_forces(_linearization(intervals, self._start), usual)
-        self.larger = likeliest_forces(calm, window.expected, window.largest, ages_of(len(window)))
-        fit, _ = followed(intervals, self._with(self.larger))
-        self._start = _moved(self._start, fit)
-        self.motion = _linearization(intervals, replace(self._start, tau=self.larger.tau, rho=self.larger.rho))
+        start = _moved(replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary), fit)
+        calm = with_forces(_linearization(intervals, start), usual)
+        larger = yield from likeliest_forces(calm, window.expected, window.largest, ages_of(len(window)))
+        yield
+        fit, _ = followed(intervals, replace(start, tau=larger.tau, rho=larger.rho))
+        yield
+        return cls(window, _moved(start, fit), usual, larger)
 
     def unchanged(self, forces: Forces) -> float:
         """Evidence, nats, of a window without a step, and with some unmodelled accelerations."""
@@ -118,7 +139,9 @@ class SteppedFits:
         last = Forces(self.larger.tau[-1], self.larger.rho)
         return likeliest(self.motion, [self.larger, *(since(self._usual, x, last) for x in (age, age + 1))])[0]
 
-    def nearby(self, first: int, changed: IntArray, sizes: FloatArray, forces: Forces) -> SteppedFit:
+    def nearby(
+        self, first: int, changed: IntArray, sizes: FloatArray, forces: Forces
+    ) -> Generator[None, None, SteppedFit]:
         """Likeliest of the fits with a step at an interval, and before and after it as long as they become likelier.
 
         Parameters
@@ -128,18 +151,21 @@ class SteppedFits:
 
         Returns
         -------
-        SteppedFit
+        generator
+            Yields after each fit, and returns the likeliest.
         """
         best = self.stepped(first, changed, sizes, forces)
+        yield
         for direction in (-1, 1):
             while 0 <= best.first + direction <= len(self._window) - 2:
                 other = self.stepped(best.first + direction, changed, best.sizes, forces)
+                yield
                 if other.evidence <= best.evidence:
                     break
                 best = other
         return best
 
-    def simplest(self, step: SteppedFit, forces: Forces) -> SteppedFit:
+    def simplest(self, step: SteppedFit, forces: Forces) -> Generator[None, None, SteppedFit]:
         """The likeliest fit without those parameters of a step that hardly make it likelier.
 
         Parameters
@@ -150,13 +176,15 @@ class SteppedFits:
 
         Returns
         -------
-        SteppedFit
+        generator
+            Yields after each fit, and returns the simplest.
         """
         best = step
         for k in step.changed:
             few = best.changed != k
             if few.any():
-                other = self.nearby(best.first, best.changed[few], best.sizes[few], forces)
+                other = self.stepped(best.first, best.changed[few], best.sizes[few], forces)
+                yield
                 best = other if other.evidence > best.evidence - AS_LIKELY else best
         return best
 

@@ -19,6 +19,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
 from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
+from diransac.identification.tracking.step_tests import ages_of
 from diransac.identification.tracking.stream import SensorWatch, Stream
 from diransac.model import Model
 from diransac.process import single_threaded
@@ -230,7 +231,9 @@ class Tracker:
             else:
                 window.extend(n)
             found = window.optimise()
-            if not window.memory.count and self._start is not None:
+            # Once a start is exact, the hold of the inputs and the steps are asked for as often as changes are tested.
+            asked = not window.is_exact or len(window) in ages_of(window.most)
+            if asked and not window.memory.count and self._start is not None:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)
                 found = window.optimise()
             self._changes.after_step(window, found)

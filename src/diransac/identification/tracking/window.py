@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
+from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
 from diransac.identification.methods.lo_diransac.scales import (
     SHRINK,
     ProcessSums,
@@ -210,21 +211,37 @@ class Window:
             root[changing, np.arange(len(changing))] = std[changing]
             self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
 
-    def begin_with(self, first: int, fit: Fit) -> None:
-        """Begin the window with one of its intervals, from a fit of those that follow.
+    def frozen(self) -> Window:
+        """The window as it is now, while this one moves on."""
+        stream = replace(self.stream, values=self.stream.values.copy(), ended=self.stream.ended.copy())
+        then = copy(self)
+        then.stream = stream
+        return then
+
+    def first_of(self, then: Window) -> int:
+        """Interval of the window as it was then with which this one begins."""
+        return (self.first - then.first) // self.length
+
+    def begin_with(self, then: Window, first: int, fit: Fit) -> None:
+        """Begin the window with an interval of what it was then, from a fit of those that followed it.
 
         Parameters
         ----------
+        then : Window
         first : int
+            Not before the first interval of this window.
         fit : Fit
-            Of these intervals; scales are those of the window.
+            Of these intervals; scales are those of this window.
         """
-        whole = self.fit
+        whole, since = self.fit, first - self.first_of(then)
+        later = slice(since + len(fit.x), None)
         scales = {name: getattr(whole, name) for name in ("tau", "rho", "continuity_std")}
-        self.first, self.times = self.first + first * self.length, self.times[first:]
+        x, d = (np.vstack([getattr(fit, name), getattr(whole, name)[later]]) for name in ("x", "d"))
+        self.first, self.times = self.first + since * self.length, self.times[since:]
         # Outliers and forces for which the change was taken until it was found are forgotten.
         self.memory = self._memories[-min(len(self.times) + 1, len(self._memories))]
-        self.fit = replace(fit, **scales)
+        self.fit = replace(fit, x=x, d=d, **scales)
+        self.fit = with_residuals(self.intervals(), self.fit)
         self.optimise()
 
     # ------------------------------------------------------------------ the fit
