@@ -204,10 +204,10 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
 
 
 def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
-    """A window from which nothing has left, as an exact model where that is likelier, and with the fewest steps.
+    """A window as an exact model with the likeliest hold of the inputs, if that is clearly likelier, or as it is.
 
-    A fit of the first second may have ended at an optimum with unmodelled accelerations, or with another hold of the
-    inputs; that of an exact model begins again with the parameters that were given, and the motion that was found.
+    A fit of the first second may have ended at an optimum with unmodelled accelerations, or with another hold; one of
+    an exact model begins with the motion that was found, and what another hold has told before the window is forgotten.
 
     Parameters
     ----------
@@ -219,13 +219,14 @@ def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
     Returns
     -------
     Setup, Fit
+        With the fewest integration steps that are enough.
     """
     none, shared = np.zeros_like(window.least), window.fit.shared if window.is_exact else given.parameters
-    best, found, least = window.setup, *_settled(window.intervals(), window.fit)
-    least -= AS_LIKELY
+    alone = replace(window.fit, boundary=window.beginning)
+    best, found, least = window.setup, window.fit, _settled(window.intervals(), alone)[1] - AS_LIKELY
     for hold in given.holds:
         own = replace(window.setup, hold=hold)
-        fit = replace(window.fit, shared=shared, tau=window.least, rho=none)
+        fit = replace(alone, shared=shared, tau=window.least, rho=none)
         fit, cost = _settled(own.intervals(window.stream, window.first, len(window)), fit)
         if cost < least:
             best, found, least = own, fit, cost

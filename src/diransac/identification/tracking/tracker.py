@@ -19,7 +19,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
 from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
-from diransac.identification.tracking.step_tests import ages_of
+from diransac.identification.tracking.step_tests import fine_ages_of
 from diransac.identification.tracking.stream import SensorWatch, Stream
 from diransac.model import Model
 from diransac.process import single_threaded
@@ -104,7 +104,7 @@ class Tracker:
         self._sensors = SensorWatch(model)
         self._window: Window | None = None
         self._notes: list[str] = []
-        self._retry, self._refused = 0, ""
+        self._retry, self._refused, self._n_updates = 0, "", 0
 
     def update(self, samples: Samples) -> TrackedEstimate | None:
         """Take samples.
@@ -231,9 +231,11 @@ class Tracker:
             else:
                 window.extend(n)
             found = window.optimise()
-            # Once a start is exact, the hold of the inputs and the steps are asked for as often as changes are tested.
-            asked = not window.is_exact or len(window) in ages_of(window.most)
-            if asked and not window.memory.count and self._start is not None:
+            self._n_updates += 1
+            # While the window fills, and of an exact model whenever all intervals are others.
+            is_due = not self._n_updates % self._steps and window.is_exact
+            is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
+            if is_due and self._start is not None:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)
                 found = window.optimise()
             self._changes.after_step(window, found)

@@ -116,6 +116,7 @@ class Window:
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
+        self.beginning = fit.boundary
         self._n_hopeless = 0
         self._measured = np.zeros(fit.d.shape[1], bool)
         n = len(fit.x)
