@@ -21,6 +21,7 @@ from diransac.identification.tracking.estimates import TrackedEstimate
 from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
 from diransac.identification.tracking.step_tests import fine_ages_of
 from diransac.identification.tracking.stream import SensorWatch, Stream
+from diransac.identification.tracking.window import AS_LIKELY
 from diransac.model import Model
 from diransac.process import single_threaded
 
@@ -232,8 +233,8 @@ class Tracker:
                 window.extend(n)
             found = window.optimise()
             self._n_updates += 1
-            # While the window fills, and of an exact model whenever all intervals are others.
-            is_due = not self._n_updates % self._steps and window.is_exact
+            # While the window fills, and whenever all intervals are others, unless forces are remembered.
+            is_due = not self._n_updates % self._steps and window.memory.freedom < AS_LIKELY
             is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
             if is_due and self._start is not None:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)

@@ -319,7 +319,8 @@ class Window:
         residuals, known = fit.residuals[rows], intervals.known[rows]
         noise = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
-        gained = n / len(intervals) * self._gained
+        # Forces that a start has taken for its errors are no evidence: it counts once all intervals are others.
+        gained = n / len(intervals) * self._gained if len(self._memories) == self.most else 0.0
         self.memory = self.memory.extended(self.kept**n, _Memory(noise, process, n * self._found, n, gained))
         self._memories.append(self.memory)
 
