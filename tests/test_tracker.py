@@ -223,6 +223,16 @@ def test_wrong_hold_of_the_inputs_is_found_while_the_window_fills():
     assert np.abs(ratios(now)).max() < 3.5
 
 
+def test_forces_of_the_start_are_not_remembered():
+    columns = columns_of(flown(1200, 5, gust=0.5))
+    tracker = dr.Tracker(MODEL, start=ROUGH, window=3.0)
+    tracker.update({n: x[:500] for n, x in columns.items()})
+    assert not tracker._window.is_exact
+    assert tracker._window.memory.freedom == 0.0
+    tracker.update({n: x[500:] for n, x in columns.items()})
+    assert tracker._window.memory.freedom > 10.0
+
+
 def test_change_since_an_identification_is_reported():
     result = dr.identify(MODEL, flown(800, 9), dr.LoDiransac(suggestions=False, sources=()))
     log = flown(700, 4, change=(-1.0, ("mass",), 1.3))
