@@ -225,7 +225,7 @@ class Changes:
         if is_full and not (fires and calibrated):
             self._learn_scatter(tests)
         self._rest -= 1
-        self._firing = self._firing + 1 if fires else 0
+        self._firing = self._firing + 1 if fires and calibrated else 0
         if not fires:
             self._doubt.undecided(np.zeros(len(self.names)))
         if is_full and self._kept is not None:
@@ -234,6 +234,11 @@ class Changes:
             self._search(window, usual)
         self._report(window)
         self._follow_drift(window)
+
+    @property
+    def is_suspected(self) -> bool:
+        """True while tests that are calibrated find a change, or one is not yet certain."""
+        return self._firing > 0 or self._kept is not None
 
     def _ages(self, window: Window, ages: Callable[[int], IntArray] = ages_of) -> IntArray:
         """Ages of changes that are tested: where a change has begun the window, those that came with it."""

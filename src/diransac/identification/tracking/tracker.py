@@ -236,7 +236,7 @@ class Tracker:
             # While the window fills, and whenever all intervals are others, unless forces are remembered.
             is_due = not self._n_updates % self._steps and window.memory.freedom < AS_LIKELY
             is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
-            if is_due and self._start is not None:
+            if is_due and self._start is not None and not self._changes.is_suspected:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)
                 found = window.optimise()
             self._changes.after_step(window, found)
