@@ -1,6 +1,7 @@
 """The tracker: the batch fit's answer, changes, hostile streams.  Its flights are simulated by plain NumPy."""
 
 import tracemalloc
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 
 import diransac as dr
 from diransac.errors import LogError, SettingsError
-from diransac.identification.tracking.changes import Drift
+from diransac.identification.tracking.changes import Doubt, Drift
 from diransac.identification.tracking.starting import smoothed_motion
+from diransac.identification.tracking.step_tests import ChangeTests
 from simulated import ROTORCRAFT, VEHICLE, as_log, flight, rotorcraft_acceleration, with_outliers
 
 DT = 0.01
@@ -180,6 +182,55 @@ def test_gusts_are_no_torques_that_nothing_measures(seed):
     *_, now = dr.track(model, log, start={"inertia": 0.0065, "lag": 0.045})
     assert now.standard_errors["inertia"] < 3e-4
     assert now.parameters["inertia"] == pytest.approx(0.006, abs=2.0 * now.standard_errors["inertia"])
+
+
+def test_search_that_is_spread_over_updates_finds_the_step(monkeypatch):
+    monkeypatch.setattr("diransac.identification.tracking.changes._WORK", 20_000)
+    log = flown(900, 0, change=(6.0, ("mass",), 1.3))
+    (found,) = [x for now in fed(columns_of(log), window=3.0) for x in now.changes]
+    assert (found.parameter, found.time) == ("mass", pytest.approx(6.0, abs=0.15))
+    assert found.detected == pytest.approx(7.5, abs=0.8)  # later than by a search within an update
+    assert found.after == pytest.approx(1.3 * 0.249, rel=0.01)
+
+
+def test_scatter_of_a_test_is_no_evidence_of_steps_of_several_parameters():
+    """Nearly collinear parameters, of which one scatters: right-hand sides remain those of the equations."""
+    information = np.array([[1.0, 0.9999], [0.9999, 1.0]]) * 1e4
+    score = information @ [0.1, 0.0]
+    own = np.diag(information)
+    pair = np.stack([score / own, np.zeros(2)])[:, None]
+    tests = ChangeTests(np.array([10]), pair, np.stack([own, own])[:, None], information[None])
+    calm = tests.steps_at_once(np.ones(2), np.ones((1, 2)))[0]
+    scattered = tests.steps_at_once(np.ones(2), np.array([[1.0, 2.0]]))[0]
+    assert 0.0 < scattered <= calm
+
+
+def test_change_that_is_not_decided_widens_the_intervals_until_tests_are_calm():
+    tests = ChangeTests(np.array([5]), np.zeros((2, 1, 2)), np.full((2, 1, 2), 1e4), np.zeros((1, 2, 2)))
+    doubt = Doubt(2)
+    doubt.undecided(np.array([0.3, 0.0]))
+    doubt.update(tests, np.ones(2), [], full=True)
+    assert doubt.variance == pytest.approx([0.09, 0.0])
+
+
+def test_wrong_hold_of_the_inputs_is_found_while_the_window_fills():
+    columns = columns_of(flown(400, 3, outliers=0.0, noise=0.3))
+    tracker = dr.Tracker(MODEL, start=ROUGH)
+    tracker.update({n: x[:130] for n, x in columns.items()})
+    tracker._window.setup = replace(tracker._window.setup, hold="smooth")
+    now = tracker.update({n: x[130:] for n, x in columns.items()})
+    assert tracker._window.setup.hold == "zero-order"
+    assert np.abs(ratios(now)).max() < 3.5
+
+
+def test_forces_of_the_start_are_not_remembered():
+    columns = columns_of(flown(1200, 5, gust=0.5))
+    tracker = dr.Tracker(MODEL, start=ROUGH, window=3.0)
+    tracker.update({n: x[:500] for n, x in columns.items()})
+    assert not tracker._window.is_exact
+    assert tracker._window.memory.freedom == 0.0
+    tracker.update({n: x[500:] for n, x in columns.items()})
+    assert tracker._window.memory.freedom > 10.0
 
 
 def test_change_since_an_identification_is_reported():

@@ -9,7 +9,7 @@
 | `window.py` | the fit of the last intervals, and what remains of those before |
 | `changes.py` | steps and drifts of parameters: tested, compared, released, reported |
 | `step_tests.py`, `forces.py` | their tests; larger unmodelled forces |
-| `stepped_fits.py` | fits of a window with a step, and with larger forces instead |
+| `search.py`, `stepped_fits.py` | fits of a window with a step, and with larger forces instead |
 | `surprise.py` | outliers where a machine may have changed |
 """
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -14,22 +14,23 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.tracking.estimates import Change
-from diransac.identification.tracking.forces import Forces, likeliest_forces, with_forces
+from diransac.identification.tracking.forces import Forces, with_forces
+from diransac.identification.tracking.search import Found, sought
 from diransac.identification.tracking.step_tests import ChangeTests, ages_of, change_tests, fine_ages_of
-from diransac.identification.tracking.stepped_fits import SteppedFit, SteppedFits
 from diransac.identification.tracking.window import AS_LIKELY
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
     from diransac.identification.tracking.starting import Setup
+    from diransac.identification.tracking.stepped_fits import SteppedFit
     from diransac.identification.tracking.window import Linearization, Window
 
 # Time over which the scatter of the tests, and drifts, are remembered, s.
 _MEMORY = 60.0
 # Ages that are tested at most: those of a window of 2^30 intervals.
 _MOST_AGES = 32
-# Time after which unmodelled accelerations that explain a window clearly better than any step are usual ones, s.
-_PATIENCE = 1.0
+# Samples times unknowns of the fits of a search in an update: three windows of a quadrotor at 250 Hz.
+_WORK = 150_000
 # Standard deviations of the changes by a drift in a second, over the size of a parameter.
 _RATES = np.concatenate([[0.0], np.logspace(-6.0, -1.0, 16)])
 # Evidence, nats, from which on a parameter drifts, or a change counts that no force has been asked to explain.
@@ -123,6 +124,8 @@ class Doubt:
 
     - What was known of a parameter before the window contradicts the window, but unmodelled forces explain that nearly
       as well as a change does: it may be either value.
+    - Tests have found a change, but a search has not told whether a step or forces explain it: parameters may be those
+      with the step.
     - A machine of which one parameter has changed may have changed in others, as a payload takes its inertia with it.
       Each may have changed by the same ratio until the motion since then tells that it has not.
 
@@ -136,12 +139,16 @@ class Doubt:
     """
 
     def __init__(self, n: int) -> None:
-        self.variance = np.zeros(n)
+        self.variance, self._undecided = np.zeros(n), np.zeros(n)
         self._ratio = 0.0
 
     def since(self, ratio: float) -> None:
         """Doubt all parameters: one has changed by this ratio where the window begins."""
         self._ratio = min(abs(ratio), 1.0)
+
+    def undecided(self, change: FloatArray) -> None:
+        """Doubt parameters that would change by some sizes ``(n,)`` with a step that is as likely as forces."""
+        self._undecided = np.square(change)
 
     def update(self, tests: ChangeTests, values: FloatArray, certain: Sequence[int], *, full: bool) -> None:
         """Doubt what the tests of a window leave open.
@@ -161,7 +168,7 @@ class Doubt:
         possible = np.square(self._ratio * values)
         possible[list(certain)] = 0.0
         self.variance = np.where(contradicted, np.square(tests.size[:, -1]), 0.0).max(axis=0)
-        self.variance += possible / (1.0 + possible * tests.information[0, -1])
+        self.variance += possible / (1.0 + possible * tests.information[0, -1]) + self._undecided
 
 
 class Changes:
@@ -192,6 +199,7 @@ class Changes:
         self._pending: list[_Pending] = []
         # What was known where the window begins with a change, as long as that may turn out to be none.
         self._kept: BoundaryPrior | None = None
+        self._searched: tuple[Window, Generator[None, None, tuple[int, Found | None]]] | None = None
         self._is_sure = False
         self._reported: list[Change] = []
         self._new: list[Change] = []
@@ -217,13 +225,20 @@ class Changes:
         if is_full and not (fires and calibrated):
             self._learn_scatter(tests)
         self._rest -= 1
-        self._firing = self._firing + 1 if fires else 0
+        self._firing = self._firing + 1 if fires and calibrated else 0
+        if not fires:
+            self._doubt.undecided(np.zeros(len(self.names)))
         if is_full and self._kept is not None:
-            self._is_sure, self._kept = True, None
-        if calibrated and (fires or self._kept is not None) and self._rest < 0:
-            self._decide(window, usual)
+            self._is_sure, self._kept, self._searched = True, None, None
+        if self._searched is not None or (calibrated and (fires or self._kept is not None) and self._rest < 0):
+            self._search(window, usual)
         self._report(window)
         self._follow_drift(window)
+
+    @property
+    def is_suspected(self) -> bool:
+        """True while tests that are calibrated find a change, or one is not yet certain."""
+        return self._firing > 0 or self._kept is not None
 
     def _ages(self, window: Window, ages: Callable[[int], IntArray] = ages_of) -> IntArray:
         """Ages of changes that are tested: where a change has begun the window, those that came with it."""
@@ -282,43 +297,47 @@ class Changes:
 
     # ------------------------------------------------------------------ a change
 
-    def _decide(self, window: Window, usual: Forces) -> None:
-        """Release the parameters that have changed from then on, unless forces or a drift explain as much."""
-        fits = SteppedFits(window, self._kept)
-        calm = with_forces(fits.motion, usual)
-        values, ages = window.fit.shared, self._ages(window, fine_ages_of)
-        tests, scatter = change_tests(calm, ages), self._scatter(ages, len(window))
-        of_steps, chosen = tests.steps_at_once(values, scatter[0])
-        place = int(np.argmax(of_steps))
-        # What has not been clear is asked again with a quarter more intervals.
-        self._rest = int(ages[place]) // 4
-        if not chosen[place].any():
-            return
-        few, first = np.flatnonzero(chosen[place]), len(window) - int(ages[place])
-        sizes, none = tests.sizes(place, chosen[place]), np.zeros_like(window.least)
-        step, forces = fits.nearby(first, few, sizes, usual), usual
-        # A change may have been taken for forces until it is found: the model may be exact with it.
-        exact = Forces(np.broadcast_to(window.least, window.fit.d.shape), none)
-        if (usual.tau > window.expected).any() and fits.stepped(first, few, sizes, exact).evidence > step.evidence:
-            step, forces = fits.nearby(first, few, sizes, exact), exact
-        age = len(window) - step.first
-        larger = likeliest_forces(calm, window.expected, window.largest, {len(window), age, min(age + 1, len(window))})
-        unchanged = {x: fits.unchanged(x) for x in (usual, forces, larger)}
-        without = max(unchanged.values())
-        if step.evidence < without:
-            step, forces = fits.stepped(step.first, few, step.sizes, larger), larger
-        if step.evidence > without:
-            step = fits.simplest(step, forces)
-        clear, scale = AS_LIKELY * len(step.changed), float(scatter[0, place, step.changed].max())
-        over_usual, over_rivals = step.evidence - unchanged[usual], step.evidence - without
-        if over_rivals > clear and over_usual > scale * self._price(ages_of(len(window))):
-            if not self._is_no_step(step, fits.linearized(step)):
-                self._release(window, step, tests.information[0, place, step.changed])
-        elif self._kept is not None and over_rivals < 0.0:
-            window.begin_with(0, fits.stepped(0, few[:0], none[:0], larger).fit)
+    def _search(self, window: Window, usual: Forces) -> None:
+        """Begin a search, or go on with it, and decide what has changed when it ends."""
+        if self._searched is None:
+            frozen, ages = window.frozen(), self._ages(window, fine_ages_of)
+            self._searched = frozen, sought(frozen, usual, self._kept, ages, self._scatter(ages, len(window))[0])
+        then, search = self._searched
+        n_rows, n_unknowns = len(then) * then.length, then.fit.x.shape[1] + then.fit.d.shape[1] + len(self.names)
+        for _ in range(max(1, round(_WORK / (n_rows * n_unknowns)))):
+            try:
+                next(search)
+            except StopIteration as end:
+                self._searched = None
+                age, found = end.value
+                # What has not been clear is asked again with a quarter more intervals.
+                self._rest = age // 4
+                if found is not None:
+                    self._decide(window, then, found)
+                return
+
+    def _decide(self, window: Window, then: Window, found: Found) -> None:
+        """Release the parameters that have changed, unless forces or a drift explain as much.
+
+        Parameters
+        ----------
+        window, then : Window
+            Now, and when the search began.
+        found : Found
+        """
+        step, larger, price = found.step, found.larger, self._price(ages_of(len(then)))
+        clear = AS_LIKELY * len(step.changed)
+        if found.over_rivals > clear and found.over_usual > found.scatter * price:
+            if step.first >= window.first_of(then) and not self._is_no_step(step, found.fits.linearized(step)):
+                self._release(window, then, step, found.known)
+        elif self._kept is not None and found.over_rivals < 0.0:
+            none = np.zeros(0)
+            window.begin_with(then, 0, found.fits.stepped(0, step.changed[:0], none, larger).fit)
             self._pending, self._kept = [], None
-        elif over_rivals < -AS_LIKELY and self._firing * self.step > _PATIENCE:
+        elif found.over_rivals < -AS_LIKELY and self._firing > len(window):
             self._usual = np.stack([np.log(larger.tau[-1]), larger.rho])
+        elif found.over_usual > price and found.over_rivals > -price:
+            self._doubt.undecided(window.fit.shared - step.fit.shared)
 
     def _is_no_step(self, step: SteppedFit, after: Linearization) -> bool:
         """True if parameters change further after a step, or end outside their bounds, or at one."""
@@ -326,12 +345,13 @@ class Changes:
         moves = change_tests(after, age).gain(values, self._scatter(age, step.first + int(age[0])))[1].max() > AS_LIKELY
         return bool(moves or self._layout.violations(values) or self._layout.on_bounds(values)[step.changed].any())
 
-    def _release(self, window: Window, step: SteppedFit, known: FloatArray) -> None:
+    def _release(self, window: Window, then: Window, step: SteppedFit, known: FloatArray) -> None:
         """Begin the window with a step, whose values are reported once it is found again, and they are known.
 
         Parameters
         ----------
-        window : Window
+        window, then : Window
+            Now, and when the search began.
         step : SteppedFit
         known : (m,) array
             Inverse variances of its sizes.
@@ -343,9 +363,10 @@ class Changes:
         size, information = np.zeros((2, len(self.names)))
         size[step.changed], information[step.changed] = step.sizes, known
         self.drift.learn(window.fit.shared, size, information, self._duration(window), 1.0, exact=window.is_exact)
-        time, before = float(window.times[step.first]), step.before[step.changed]
+        time, before = float(then.times[step.first]), step.before[step.changed]
         self._doubt.since(float(np.abs(step.sizes / before[:, 0]).max()))
-        window.begin_with(step.first, step.fit)
+        self._doubt.undecided(np.zeros(len(self.names)))
+        window.begin_with(then, step.first, step.fit)
         earlier = [x for x in self._pending if self._kept is None and x.index not in step.changed]
         new = zip(step.changed, before.tolist(), strict=True)
         self._pending = [*earlier, *(_Pending(int(k), time, *x) for k, x in new)]
@@ -362,7 +383,7 @@ class Changes:
             if settled and change > significant * both and self._is_sure:
                 self._pending.remove(one)
                 self._say(one, after, error, float(now))
-                self._kept = None
+                self._kept, self._searched = None, None
             elif now - one.time > 2.0 * window.most * window.length * window.stream.dt:
                 self._pending.remove(one)
         self._before = window.fit.shared

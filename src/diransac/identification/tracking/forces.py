@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.window import Linearization
 
 # Correlations of unmodelled accelerations that are larger than usual, and number of their sizes.
-_GUST = 0.9
-_CORRELATIONS, _SIZES = (_GUST, 0.98), 5
+_GUST, _SLOW = 0.9, 0.98
+_SIZES = 5
 
 
 class _Terms(NamedTuple):
@@ -83,7 +83,9 @@ def with_forces(found: Linearization, forces: Forces) -> Linearization:
     return replace(found, fit=fit, at=replace(at, system=system, right_z=right))
 
 
-def likeliest_forces(found: Linearization, least: FloatArray, most: FloatArray, ages: Iterable[int]) -> Forces:
+def likeliest_forces(
+    found: Linearization, least: FloatArray, most: FloatArray, ages: Iterable[int]
+) -> Generator[None, None, Forces]:
     """Unmodelled accelerations that explain a linearised window best: its own, or larger ones, as a gust has.
 
     All become larger from a time on, and then each by itself, as long as the evidence grows.
@@ -98,27 +100,33 @@ def likeliest_forces(found: Linearization, least: FloatArray, most: FloatArray, 
 
     Returns
     -------
-    Forces
+    generator
+        Yields where it may be interrupted, and returns the accelerations.
     """
-    W, usual = len(found.fit.x), Forces(np.broadcast_to(found.fit.tau, found.fit.d.shape), found.fit.rho)
-    low = np.maximum(usual.tau, least)
+    usual = Forces(np.broadcast_to(found.fit.tau, found.fit.d.shape), found.fit.rho)
+    low, rho = np.maximum(usual.tau, least), np.maximum(usual.rho, _GUST)
     sizes = [low * (np.maximum(most, low) / low) ** share for share in np.linspace(0.0, 1.0, _SIZES)]
-    since = [(np.arange(W) >= W - age)[:, None] for age in ages]
-    common = [
-        Forces(np.where(now, tau, usual.tau), np.maximum(usual.rho, rho))
-        for now in since
-        for tau in sizes
-        for rho in _CORRELATIONS
-    ]
-    best, evidence = _likeliest(found, [usual, *common])
-    for axis in np.eye(len(least), dtype=bool):
+    best = likeliest(found, [Forces(tau, rho) for tau in sizes])[0]
+    best = likeliest(found, [since(usual, age, best) for age in ages])[0]
+    now = np.any(best.tau > usual.tau, axis=1, keepdims=True)
+    trials = [usual, *(Forces(np.where(now, tau, usual.tau), rho) for tau in sizes)]
+    best, evidence = likeliest(found, [*trials, Forces(best.tau, np.maximum(rho, _SLOW))])
+    for k in np.flatnonzero((low < most).any(axis=0)):
+        yield
+        axis = np.arange(len(least)) == k
         of_axis = [usual.tau, *(np.where(best.tau > usual.tau, tau, usual.tau) for tau in sizes)]
         trials = [Forces(np.where(axis, tau, best.tau), best.rho) for tau in of_axis]
-        best, evidence = max((best, evidence), _likeliest(found, trials), key=lambda x: x[1])
+        best, evidence = max((best, evidence), likeliest(found, trials), key=lambda x: x[1])
     return best
 
 
-def _likeliest(found: Linearization, trials: Sequence[Forces]) -> tuple[Forces, float]:
+def since(usual: Forces, age: int, larger: Forces) -> Forces:
+    """Unmodelled accelerations as usual, and larger ones in some intervals at the end."""
+    now = np.arange(len(usual.tau)) >= len(usual.tau) - age
+    return Forces(np.where(now[:, None], larger.tau, usual.tau), larger.rho)
+
+
+def likeliest(found: Linearization, trials: Sequence[Forces]) -> tuple[Forces, float]:
     """Those of some unmodelled accelerations with the largest evidence, and that."""
     return max(((x, _evidence(with_forces(found, x))) for x in trials), key=lambda x: x[1])
 
@@ -143,7 +151,7 @@ def gain_of_freedom(found: Linearization, least: FloatArray, expected: FloatArra
     others = [Forces(expected, none), Forces(np.minimum(30.0 * expected, most), none + _GUST)]
     if (found.fit.tau > least).any():
         others = [Forces(found.fit.tau, found.fit.rho)]
-    return _likeliest(found, others)[1] - _likeliest(found, [Forces(least, none)])[1]
+    return likeliest(found, others)[1] - likeliest(found, [Forces(least, none)])[1]
 
 
 def _evidence(found: Linearization) -> float:

@@ -18,11 +18,13 @@ from diransac.identification.methods.lo_diransac import LoDiransac
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
+from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.refinement import make_prior, refine, start
+from diransac.identification.methods.lo_diransac.refinement import make_prior, negative_log_evidence, refine, start
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion
+from diransac.identification.tracking.surprise import followed
 from diransac.identification.tracking.window import AS_LIKELY, Window
 
 if TYPE_CHECKING:
@@ -197,9 +199,54 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     for hold in others:
         other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
         best = other if other.cost < best.cost - AS_LIKELY else best
-    few = with_fewest_steps(best.setup.intervals(stream, first, n), best.fit, setup.settings.substeps)[0].substeps
-    begun_setup = replace(best.setup, settings=replace(setup.settings, substeps=few))
-    return Window(begun_setup, stream, first, best.fit, motion.spread, most)
+    begun_setup, fit = _with_fewest_steps(setup, best.setup, stream, first, best.fit)
+    return Window(begun_setup, stream, first, fit, motion.spread, most)
+
+
+def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
+    """A window as an exact model with the likeliest hold of the inputs, if that is clearly likelier, or as it is.
+
+    A fit of the first second may have ended at an optimum with unmodelled accelerations, or with another hold; one of
+    an exact model begins with the motion that was found, and what another hold has told before the window is forgotten.
+
+    Parameters
+    ----------
+    setup : Setup
+        With the most integration steps.
+    window : Window
+    given : Start
+
+    Returns
+    -------
+    Setup, Fit
+        With the fewest integration steps that are enough.
+    """
+    none, shared = np.zeros_like(window.least), window.fit.shared if window.is_exact else given.parameters
+    alone = replace(window.fit, boundary=window.beginning)
+    best, found, least = window.setup, window.fit, _settled(window.intervals(), alone)[1] - AS_LIKELY
+    for hold in given.holds:
+        own = replace(window.setup, hold=hold)
+        fit = replace(alone, shared=shared, tau=window.least, rho=none)
+        fit, cost = _settled(own.intervals(window.stream, window.first, len(window)), fit)
+        if cost < least:
+            best, found, least = own, fit, cost
+    return _with_fewest_steps(setup, best, window.stream, window.first, found)
+
+
+def _settled(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, float]:
+    """A fit after some steps, and its negative log evidence, nats; infinite where simulations overflow from there."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            fit, solved = followed(intervals, with_residuals(intervals, fit))
+    except np.linalg.LinAlgError:
+        return fit, np.inf
+    return fit, negative_log_evidence(intervals, fit, solved.log_det)
+
+
+def _with_fewest_steps(setup: Setup, own: Setup, stream: Stream, first: int, fit: Fit) -> tuple[Setup, Fit]:
+    """A problem with the fewest integration steps of one with the most that change no parameter of a fit noticeably."""
+    few, fit = with_fewest_steps(own.intervals(stream, first, len(fit.x)), fit, setup.settings.substeps)
+    return replace(own, settings=replace(setup.settings, substeps=few.substeps)), fit
 
 
 class _Begun(NamedTuple):

@@ -84,13 +84,12 @@ class ChangeTests:
             Parameters that change.
         """
         ages, prior = np.arange(len(self.ages)), np.square(values)
-        std = np.sqrt(scatter)
-        M, score = self.of_steps / (std[:, :, None] * std[:, None, :]), self.size[0] * self.information[0] / scatter
-        own, total, chosen = self.information[0] / scatter, np.zeros(len(ages)), np.zeros(score.shape, bool)
+        M, own, score = self.of_steps, self.information[0], self.size[0] * self.information[0]
+        total, chosen = np.zeros(len(ages)), np.zeros(score.shape, bool)
         for k in range(len(values)):
             left = np.maximum(np.einsum("ajj->aj", M), 0.0)
             # Those before must leave some of the information of another parameter, which must add clear evidence.
-            more = np.where(left > 1e-3 * own, _gain(score, left, prior), -np.inf)
+            more = np.where(left > 1e-3 * own, _gain(score, left, prior) / scatter, -np.inf)
             j = np.argmax(more, axis=1)
             grows = more[ages, j] > (10.0 if k else 0.0)
             if not grows.any():

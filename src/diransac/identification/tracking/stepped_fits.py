@@ -8,6 +8,7 @@ that the change has distorted tells how large it is, or what else it may be.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,13 +20,14 @@ from diransac.identification.methods.lo_diransac.gauss_newton import bounded, li
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import diverges, negative_log_evidence
+from diransac.identification.tracking.forces import Forces, likeliest, likeliest_forces, since, with_forces
+from diransac.identification.tracking.step_tests import ages_of
 from diransac.identification.tracking.surprise import followed, free_motion
 from diransac.identification.tracking.window import AS_LIKELY, Linearization
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
-    from diransac.identification.tracking.forces import Forces
     from diransac.identification.tracking.window import Window
 
 # Standard deviation of a time within an interval, over its duration.
@@ -79,33 +81,67 @@ class SteppedFits:
     Parameters
     ----------
     window : Window
-    boundary : BoundaryPrior, optional
-        What is known from before the window; by default what its fit takes for that.
+    start : Fit
+        With the motion from which all fits start: that of the larger unmodelled accelerations.
+    usual, larger : Forces
+        Unmodelled accelerations from before the window, and the likeliest ones.
 
     Attributes
     ----------
     motion : Linearization
-        At the motion that follows the samples.
+        At this motion.
     """
 
-    def __init__(self, window: Window, boundary: BoundaryPrior | None = None) -> None:
-        self._window = window
+    def __init__(self, window: Window, start: Fit, usual: Forces, larger: Forces) -> None:
+        self._window, self._start, self._usual, self.larger = window, start, usual, larger
+        self.motion = _linearization(window.intervals(), self._with(larger))
+        self._fits_before: dict[tuple[int, Forces], _Before] = {}
+
+    @classmethod
+    def of(cls, window: Window, usual: Forces, boundary: BoundaryPrior | None) -> Generator[None, None, SteppedFits]:
+        """Explanations of a window as it is now.
+
+        Parameters
+        ----------
+        window : Window
+            That does not move on.
+        usual : Forces
+            Unmodelled accelerations from before the window.
+        boundary : BoundaryPrior, optional
+            What is known from before the window; by default what its fit takes for that.
+
+        Returns
+        -------
+        generator
+            Yields where it may be interrupted, and returns them.
+        """
         intervals = window.intervals()
         fit = free_motion(window, intervals, len(window))
+        yield
         known = NoiseSums.of(fit.residuals, intervals.known, fit.noise.inlying(fit.residuals, intervals.known))
         noise = fit.noise.of_sums(known.plus(window.memory.noise))
-        motion = {name: getattr(fit, name) for name in ("x", "d", "residuals", "ends")}
-        self._start = replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary, **motion)
-        self.motion = _linearization(intervals, self._start)
-        self._fits_before: dict[tuple[int, Forces], _Before] = {}
+        start = _moved(replace(window.fit, noise=noise, boundary=boundary or window.fit.boundary), fit)
+        calm = with_forces(_linearization(intervals, start), usual)
+        larger = yield from likeliest_forces(calm, window.expected, window.largest, ages_of(len(window)))
+        yield
+        fit, _ = followed(intervals, replace(start, tau=larger.tau, rho=larger.rho))
+        yield
+        return cls(window, _moved(start, fit), usual, larger)
 
     def unchanged(self, forces: Forces) -> float:
         """Evidence, nats, of a window without a step, and with some unmodelled accelerations."""
         intervals = self.motion.intervals
-        fit, solved = followed(intervals, replace(self._start, tau=forces.tau, rho=forces.rho))
+        fit, solved = followed(intervals, self._with(forces))
         return -negative_log_evidence(intervals, fit, solved.log_det)
 
-    def nearby(self, first: int, changed: IntArray, sizes: FloatArray, forces: Forces) -> SteppedFit:
+    def larger_since(self, age: int) -> Forces:
+        """Likeliest unmodelled accelerations that may have become larger with a step, some intervals before the end."""
+        last = Forces(self.larger.tau[-1], self.larger.rho)
+        return likeliest(self.motion, [self.larger, *(since(self._usual, x, last) for x in (age, age + 1))])[0]
+
+    def nearby(
+        self, first: int, changed: IntArray, sizes: FloatArray, forces: Forces
+    ) -> Generator[None, None, SteppedFit]:
         """Likeliest of the fits with a step at an interval, and before and after it as long as they become likelier.
 
         Parameters
@@ -115,18 +151,21 @@ class SteppedFits:
 
         Returns
         -------
-        SteppedFit
+        generator
+            Yields after each fit, and returns the likeliest.
         """
         best = self.stepped(first, changed, sizes, forces)
+        yield
         for direction in (-1, 1):
             while 0 <= best.first + direction <= len(self._window) - 2:
                 other = self.stepped(best.first + direction, changed, best.sizes, forces)
+                yield
                 if other.evidence <= best.evidence:
                     break
                 best = other
         return best
 
-    def simplest(self, step: SteppedFit, forces: Forces) -> SteppedFit:
+    def simplest(self, step: SteppedFit, forces: Forces) -> Generator[None, None, SteppedFit]:
         """The likeliest fit without those parameters of a step that hardly make it likelier.
 
         Parameters
@@ -137,13 +176,15 @@ class SteppedFits:
 
         Returns
         -------
-        SteppedFit
+        generator
+            Yields after each fit, and returns the simplest.
         """
         best = step
         for k in step.changed:
             few = best.changed != k
             if few.any():
-                other = self.nearby(best.first, best.changed[few], best.sizes[few], forces)
+                other = self.stepped(best.first, best.changed[few], best.sizes[few], forces)
+                yield
                 best = other if other.evidence > best.evidence - AS_LIKELY else best
         return best
 
@@ -217,8 +258,17 @@ class SteppedFits:
 
     def _part(self, intervals: slice, forces: Forces) -> Fit:
         """Motion of some intervals, with some unmodelled accelerations."""
-        whole = self._start
-        return replace(whole, x=whole.x[intervals], d=whole.d[intervals], tau=forces.tau[intervals], rho=forces.rho)
+        whole = self._with(forces)
+        return replace(whole, x=whole.x[intervals], d=whole.d[intervals], tau=forces.tau[intervals])
+
+    def _with(self, forces: Forces) -> Fit:
+        """Motion from which fits start, with some unmodelled accelerations."""
+        return replace(self._start, tau=forces.tau, rho=forces.rho)
+
+
+def _moved(fit: Fit, motion: Fit) -> Fit:
+    """A fit with the motion of another."""
+    return replace(fit, x=motion.x, d=motion.d, residuals=motion.residuals, ends=motion.ends)
 
 
 def _linearization(intervals: ShootingIntervals, fit: Fit) -> Linearization:

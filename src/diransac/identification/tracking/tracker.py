@@ -18,8 +18,10 @@ from diransac.errors import DiransacError, LogError, SettingsError
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
-from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, smoothed_motion
+from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
+from diransac.identification.tracking.step_tests import fine_ages_of
 from diransac.identification.tracking.stream import SensorWatch, Stream
+from diransac.identification.tracking.window import AS_LIKELY
 from diransac.model import Model
 from diransac.process import single_threaded
 
@@ -103,7 +105,7 @@ class Tracker:
         self._sensors = SensorWatch(model)
         self._window: Window | None = None
         self._notes: list[str] = []
-        self._retry, self._refused = 0, ""
+        self._retry, self._refused, self._n_updates = 0, "", 0
 
     def update(self, samples: Samples) -> TrackedEstimate | None:
         """Take samples.
@@ -192,8 +194,9 @@ class Tracker:
             return
         parts = stream.parts
         try:
-            window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
-            window.optimise()
+            with np.errstate(over="ignore", invalid="ignore"):
+                window = begun(self._setup, stream, first, n * parts, self._start, self._steps * parts)
+                window.optimise()
         except DiransacError as error:  # too few samples as yet
             self._retry, self._refused = end + stream.length, str(error)
         except np.linalg.LinAlgError:
@@ -228,7 +231,15 @@ class Tracker:
                 window.join(states)
             else:
                 window.extend(n)
-            self._changes.after_step(window, window.optimise())
+            found = window.optimise()
+            self._n_updates += 1
+            # While the window fills, and whenever all intervals are others, unless forces are remembered.
+            is_due = not self._n_updates % self._steps and window.memory.freedom < AS_LIKELY
+            is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
+            if is_due and self._start is not None and not self._changes.is_suspected:
+                window.setup, window.fit = begun_anew(self._setup, window, self._start)
+                found = window.optimise()
+            self._changes.after_step(window, found)
         except np.linalg.LinAlgError:
             self._begin_anew()
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
+from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
 from diransac.identification.methods.lo_diransac.scales import (
     SHRINK,
     ProcessSums,
@@ -115,6 +116,7 @@ class Window:
     def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
+        self.beginning = fit.boundary
         self._n_hopeless = 0
         self._measured = np.zeros(fit.d.shape[1], bool)
         n = len(fit.x)
@@ -210,21 +212,37 @@ class Window:
             root[changing, np.arange(len(changing))] = std[changing]
             self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
 
-    def begin_with(self, first: int, fit: Fit) -> None:
-        """Begin the window with one of its intervals, from a fit of those that follow.
+    def frozen(self) -> Window:
+        """The window as it is now, while this one moves on."""
+        stream = replace(self.stream, values=self.stream.values.copy(), ended=self.stream.ended.copy())
+        then = copy(self)
+        then.stream = stream
+        return then
+
+    def first_of(self, then: Window) -> int:
+        """Interval of the window as it was then with which this one begins."""
+        return (self.first - then.first) // self.length
+
+    def begin_with(self, then: Window, first: int, fit: Fit) -> None:
+        """Begin the window with an interval of what it was then, from a fit of those that followed it.
 
         Parameters
         ----------
+        then : Window
         first : int
+            Not before the first interval of this window.
         fit : Fit
-            Of these intervals; scales are those of the window.
+            Of these intervals; scales are those of this window.
         """
-        whole = self.fit
+        whole, since = self.fit, first - self.first_of(then)
+        later = slice(since + len(fit.x), None)
         scales = {name: getattr(whole, name) for name in ("tau", "rho", "continuity_std")}
-        self.first, self.times = self.first + first * self.length, self.times[first:]
+        x, d = (np.vstack([getattr(fit, name), getattr(whole, name)[later]]) for name in ("x", "d"))
+        self.first, self.times = self.first + since * self.length, self.times[since:]
         # Outliers and forces for which the change was taken until it was found are forgotten.
         self.memory = self._memories[-min(len(self.times) + 1, len(self._memories))]
-        self.fit = replace(fit, **scales)
+        self.fit = replace(fit, x=x, d=d, **scales)
+        self.fit = with_residuals(self.intervals(), self.fit)
         self.optimise()
 
     # ------------------------------------------------------------------ the fit
@@ -301,7 +319,8 @@ class Window:
         residuals, known = fit.residuals[rows], intervals.known[rows]
         noise = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
         process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
-        gained = n / len(intervals) * self._gained
+        # Forces that a start has taken for its errors are no evidence: it counts once all intervals are others.
+        gained = n / len(intervals) * self._gained if len(self._memories) == self.most else 0.0
         self.memory = self.memory.extended(self.kept**n, _Memory(noise, process, n * self._found, n, gained))
         self._memories.append(self.memory)
 
