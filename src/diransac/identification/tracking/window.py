@@ -390,7 +390,7 @@ def _marginal(at: NormalEquations, intervals: ShootingIntervals, fit: Fit, n: in
 def _beforehand(fit: Fit, own: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Information and right-hand side of the first interval's unknowns before its measurements."""
     if fit.boundary is not None:
-        return fit.boundary.information, fit.boundary.right(fit)
+        return fit.boundary.information, fit.boundary.right(fit.at_boundary)
     n_x = fit.x.shape[1]
     k = n_x + len(own)
     information, right = np.zeros((k + len(fit.shared),) * 2), np.zeros(k + len(fit.shared))

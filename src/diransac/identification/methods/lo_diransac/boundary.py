@@ -15,14 +15,10 @@ Sibley, Matthies, Sukhatme 2010 (sliding window filter); Bierman 1977 (square-ro
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
 
 # Part of the largest eigenvalue, of information that is scaled to a diagonal of one, that rounding leaves of none.
 _ROUNDING = 1e-14
@@ -97,16 +93,16 @@ class BoundaryPrior:
         covariance = half @ half.T
         return self.point + covariance @ (self.root.T @ self.offset), covariance
 
-    def right(self, fit: Fit) -> FloatArray:
-        """Minus half the gradient of twice the cost, ``(n,)``, at a fit."""
-        return self.root.T @ self._deviation(fit)
+    def right(self, unknowns: FloatArray) -> FloatArray:
+        """Minus half the gradient of twice the cost, ``(n,)``, at some unknowns ``(n,)``."""
+        return self.root.T @ self._deviation(unknowns)
 
-    def cost(self, fit: Fit) -> float:
-        """Twice the cost at a fit."""
-        return float(np.square(self._deviation(fit)).sum())
+    def cost(self, unknowns: FloatArray) -> float:
+        """Twice the cost at some unknowns ``(n,)``."""
+        return float(np.square(self._deviation(unknowns)).sum())
 
-    def _deviation(self, fit: Fit) -> FloatArray:
-        return self.offset - self.root @ (boundary_unknowns(fit) - self.point)
+    def _deviation(self, unknowns: FloatArray) -> FloatArray:
+        return self.offset - self.root @ (unknowns - self.point)
 
     def faded(self, weight: float) -> BoundaryPrior:
         """The Gaussian with its information multiplied by a weight."""
@@ -130,8 +126,3 @@ class BoundaryPrior:
         factor = np.linalg.cholesky(np.eye(len(self.root)) + by_change @ by_change.T)
         solved = np.linalg.solve(factor, np.column_stack([self.root, self.offset]))
         return replace(self, root=solved[:, :-1], offset=solved[:, -1])
-
-
-def boundary_unknowns(fit: Fit) -> FloatArray:
-    """State and unmodelled accelerations at the start of a fit, and the shared unknowns, as one vector ``(n,)``."""
-    return np.concatenate([fit.x[0], fit.d[0], fit.shared])

@@ -81,6 +81,11 @@ class Fit:
     prior_mean: FloatArray
     boundary: BoundaryPrior | None = None
 
+    @property
+    def at_boundary(self) -> FloatArray:
+        """State and unmodelled accelerations at the start, and the shared unknowns, as one vector ``(n,)``."""
+        return np.concatenate([self.x[0], self.d[0], self.shared])
+
     def jumps(self, intervals: ShootingIntervals) -> FloatArray:
         """States at the intervals' starts less the ends of the intervals before, (W - 1, n_x); 0 where unlinked."""
         return np.where(intervals.linked[:, None], self.x[1:] - self.ends[:-1], 0.0)
@@ -249,7 +254,7 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     corner = corner + np.diag(beforehand)
     right = right - beforehand * (fit.shared - fit.prior_mean)
     if fit.boundary is not None:
-        known, pull = fit.boundary.information, fit.boundary.right(fit)
+        known, pull = fit.boundary.information, fit.boundary.right(fit.at_boundary)
         H[0, :k, :k] += known[:k, :k]
         border[0] += known[:k, k:]
         corner += known[k:, k:]
@@ -457,7 +462,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
         np.square(fit.jumps(intervals) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
-        0.0 if fit.boundary is None else fit.boundary.cost(fit),
+        0.0 if fit.boundary is None else fit.boundary.cost(fit.at_boundary),
     )
     total = float(sum(terms))
     return total if np.isfinite(total) else np.inf
