@@ -122,7 +122,6 @@ def main() -> None:
         for kind in ("processes", "Dask"):
             for n in map(int, given.workers.split(",")):
                 store = folder / f"{kind}{n}.db"
-
                 run = partial(identify_each, model, files, given.method, store=store, **options)
                 wall, work = timed(partial(run, jobs=n) if kind == "processes" else partial(on_dask, n, run))
                 row, stored = work / len(files), store.stat().st_size / len(files)

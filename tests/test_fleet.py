@@ -4,7 +4,7 @@ import csv
 import json
 import os
 import sqlite3
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 import diransac as dr
 from command_line import run
 from diransac.errors import SettingsError, StudyError
-from diransac.study import FleetRows, FleetStatus, fleet_status, identify_each, read_fleet, summarise_fleet
+from diransac.study import FleetRows, FleetStatus, engine, fleet_status, identify_each, read_fleet, summarise_fleet
 from diransac.study.fleet import export_fleet
 
 N_VEHICLES, N_LOGS = 20, 10
@@ -125,8 +125,8 @@ def identified(store: Path, logs: list[Path], method: str = "ols", model: dr.Mod
         return identify_each(model, logs, method, store=store, executor=threads, **arguments)
 
 
-@pytest.mark.parametrize(("batch_size", "n_tasks"), [(None, 2), (30, 2), (3, 20)])
-def test_batches_of_short_logs_are_joined_unless_their_size_is_given(batch_size, n_tasks, tmp_path):
+@pytest.mark.parametrize(("batch_size", "n_tasks"), [(None, 4), (30, 2), (3, 20)])
+def test_batches_of_short_logs_are_joined_unless_their_size_is_given(batch_size, n_tasks, tmp_path, monkeypatch):
     class Counting(ThreadPoolExecutor):
         n_tasks = 0
 
@@ -134,11 +134,34 @@ def test_batches_of_short_logs_are_joined_unless_their_size_is_given(batch_size,
             self.n_tasks += 1
             return super().submit(*arguments, **named)
 
+    monkeypatch.setattr(engine, "_SECONDS", 100.0)
     files = [tmp_path / "a" / f"{k}.csv" for k in range(60)]  # that are missing, which takes no time
     with Counting(1) as threads:
         options = {"vehicle": PATTERN, "executor": threads, "tasks": 1, "batch_size": batch_size}
         found = identify_each(MODEL, files, "ols", store=tmp_path / "fleet.db", **options)
     assert (found.failed, threads.n_tasks) == (60, n_tasks)
+
+
+def test_a_log_that_kills_its_worker_is_tried_again_without_most_of_its_batch(tmp_path, monkeypatch):
+    lost = list[int]()
+
+    class Losing(ThreadPoolExecutor):
+        def submit(self, function, /, compute, keys):
+            if any("13" in name for (name,) in keys):
+                lost.append(len(keys))
+                future = Future()
+                future.set_exception(BrokenExecutor("it is dead"))
+                return future
+            return super().submit(function, compute, keys)
+
+    monkeypatch.setattr(engine, "_SECONDS", 100.0)
+    monkeypatch.setattr(engine.random.SystemRandom, "sample", lambda _self, batches, _n: list(batches))
+    files = [tmp_path / "a" / f"{k}.csv" for k in range(60)]
+    with Losing(1) as threads, pytest.raises(StudyError, match="lost 3 times"):
+        identify_each(MODEL, files, "ols", vehicle=PATTERN, executor=threads, tasks=1, store=tmp_path / "fleet.db")
+    assert lost[0] > 4
+    assert lost[1:] == [4, 4]
+    assert fleet_status(tmp_path / "fleet.db").failed == 56
 
 
 def test_a_log_whose_file_has_changed_is_identified_again_and_one_that_was_only_copied_is_not(logs, tmp_path):

@@ -14,7 +14,8 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.errors import ModelError, ResultError
+from diransac.errors import ModelError, ResultError, TimeLimitError
+from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.methods.lo_diransac import without_equations
 from diransac.identification.methods.lo_diransac.following import Predictor
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised
@@ -322,10 +323,31 @@ def test_a_fit_that_does_not_follow_the_motion_begins_elsewhere(
     log = log_of_carts(carts(1.0, damping=2.0), u, 0)
     (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
     model = dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"])
-    result = dr.identify(model, log)
+    result = dr.identify(model, log, seed=-1)
     assert len(set(np.ravel(starts))) == len(starts) == min(failing + 1, 4)
     assert ("lacks 50 % of each change of velocity" in str(result)) == (failing == 9)
     assert (str(result.verdict) == "do not rely on this") == (failing == 9)
+
+
+def test_a_time_limit_during_a_further_start_is_said_and_the_best_so_far_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = list[Any]()
+
+    def fitted(predictor: Predictor, start: Any, **options: Any) -> Minimum:
+        starts.append(start)
+        found = minimised(predictor, start, **options)
+        if len(starts) == 1:
+            last = replace(found.last, losses=found.last.losses + 1.0)
+            return replace(found, predictor=replace(found.predictor, lacks=0.5), parameters=start, last=last)
+        raise TimeLimitError
+
+    monkeypatch.setattr(without_equations, "minimised", fitted)
+    log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
+    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)
+    assert result.stop_reason == TIME_LIMIT
+    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_parameters_are_those_without_a_delay_that_is_not_significant(tmp_path: Path) -> None:

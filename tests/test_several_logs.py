@@ -366,7 +366,6 @@ def rubbing(k: int, mass: float) -> dr.Log:
 
 
 def test_logs_of_a_machine_that_the_model_does_not_describe_agree_unless_one_has_another_mass():
-    """Each log's own estimate is by simulation error then, not by an identification of its own."""
     alike, other = (
         dr.identify(SLIDER, [rubbing(k, x) for k, x in enumerate(masses)], differentiate=True)
         for masses in ((2.0, 2.0, 2.0), (2.0, 4.0, 2.0))
@@ -639,6 +638,13 @@ def test_estimates_of_logs_are_those_of_each_identified_alone():
         for name, error in alone.standard_errors.items():
             assert own.parameters[name] == pytest.approx(alone.parameters[name], abs=0.3 * error)
             assert own.standard_errors[name] == pytest.approx(error, rel=0.3)
+
+
+def test_a_dataset_keeps_the_last_value_of_a_key():
+    dataset = Dataset.of(SLIDER, [sliding(0, 400, 0.0)])
+    dataset.keep("key", 1)
+    dataset.keep("key", 2)
+    assert dataset.kept("key", int) == 2
 
 
 def test_a_log_that_is_too_short_to_be_compared_is_named():

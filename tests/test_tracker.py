@@ -205,7 +205,7 @@ def test_scatter_of_a_test_is_no_evidence_of_steps_of_several_parameters():
     assert 0.0 < scattered <= calm
 
 
-def test_change_that_is_not_decided_widens_the_intervals_until_tests_are_calm():
+def test_doubt_of_a_change_that_is_not_decided_widens_intervals():
     tests = ChangeTests(np.array([5]), np.zeros((2, 1, 2)), np.full((2, 1, 2), 1e4), np.zeros((1, 2, 2)))
     doubt = Doubt(2)
     doubt.undecided(np.array([0.3, 0.0]))

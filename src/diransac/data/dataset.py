@@ -380,8 +380,19 @@ class Dataset:
             if known == key:
                 return cast("T", value)
         value = make()
-        self._kept.append((key, value))
+        self.keep(key, value)
         return value
+
+    def keep(self, key: object, value: object) -> None:
+        """Keep a value, instead of one under an equal key, as long as the dataset lives.
+
+        Parameters
+        ----------
+        key : object
+            All that the value depends on besides the dataset.
+        value : object
+        """
+        self._kept[:] = [*((known, x) for known, x in self._kept if known != key), (key, value)]
 
     def by_signal(self, values: Mapping[str, float]) -> FloatArray:
         """Values in the signals' order.

@@ -36,8 +36,8 @@ from diransac.simulation import default_threads
 from diransac.study.store import Key, Store, Work
 from diransac.time_limit import time_left, time_limited
 
-# Work of joined batches at most, s: what is lost with a worker, and far more than a task's price.
-_SECONDS = 1.0
+# Logs of a batch, and work of joined ones at most, s: what is lost with a worker, and far more than a task's price.
+_LOGS, _SECONDS = 4, 1.0
 
 Progress = Callable[[int, int], None]
 """Called with (rows present, rows asked for)."""
@@ -65,7 +65,7 @@ def run_work(
     ----------
     work : study or fleet
     compute : of a batch of rows; a row that fails says so, an error ends the run
-    batch_size : trials or logs of a batch; None: four, or as many of a level as take about a second
+    batch_size : trials or logs of a batch; None: logs, four or as many as take about a second
     store, executor, jobs, tasks, time_limit, progress : as in `run_study`
     stale : those of some rows of the store that are to be computed again
 
@@ -92,7 +92,7 @@ def run_work(
         finished = kept.finished()
         missing = [key for key in asked if key not in finished]
         note = progress or (lambda _done, _asked: None)
-        run = _Run(compute, _batches(missing, batch_size or 4), kept, len(asked), note, joins=batch_size is None)
+        run = _Run(compute, _batches(missing, batch_size or _LOGS), kept, len(asked), note, joins=batch_size is None)
         if executor is not None:
             run.on(executor, tasks)
             return
@@ -107,14 +107,9 @@ def _batches(keys: Iterable[Key], size: int) -> list[tuple[Key, ...]]:
     """Keys in batches of one level and `size` trials at most; a log is a trial."""
     levels: dict[Key, dict[Key, list[Key]]] = defaultdict(lambda: defaultdict(list))
     for key in keys:
-        levels[_level(key)][key[:2]].append(key)
+        levels[key[:1] if len(key) > 1 else ()][key[:2]].append(key)
     of_trials = [list(trials.values()) for trials in levels.values()]
     return [tuple(chain(*some[k : k + size])) for some in of_trials for k in range(0, len(some), size)]
-
-
-def _level(key: Key) -> Key:
-    """Level of a trial; all logs have one."""
-    return key[:1] if len(key) > 1 else ()
 
 
 def _timed(compute: Computation, keys: Sequence[Key]) -> tuple[Sequence[dict[str, Any]], float]:
@@ -137,7 +132,7 @@ class _Run:
         joins: bool,
     ) -> None:
         self._compute, self._store, self._progress, self._n_asked = compute, store, progress, asked
-        self._joins, self._n_timed, self._seconds = joins, 0, 0.0
+        self._joins, self._most, self._n_timed, self._seconds = joins, 0, 0, 0.0
         self._missing = set(chain(*batches))
         # Another process on the same store has another order, so that both seldom run the same batch.
         self._waiting = deque((batch, 0) for batch in random.SystemRandom().sample(batches, len(batches)))
@@ -165,12 +160,16 @@ class _Run:
                 future.cancel()
 
     def _next(self) -> tuple[tuple[Key, ...], int]:
-        """The next batch, joined with those behind it while they are short: a task has its price."""
+        """The next batch, joined with those behind it while they are short: a task has its price.
+
+        Those that end first are the short ones: joined batches at most double.
+        """
         batch, attempts = self._waiting.popleft()
         each = self._seconds / self._n_timed if self._n_timed else math.inf
         while self._joins and self._waiting and not attempts:
             more, lost = self._waiting[0]
-            if lost or (len(batch) + len(more)) * each > _SECONDS or _level(more[0]) != _level(batch[0]):
+            n = len(batch) + len(more)
+            if lost or n > self._most or n * each > _SECONDS:
                 break
             batch += self._waiting.popleft()[0]
         return batch, attempts
@@ -190,6 +189,7 @@ class _Run:
         if error is None:
             rows, seconds = future.result()
             self._seconds, self._n_timed = self._seconds + seconds, self._n_timed + len(batch)
+            self._most = max(self._most, 2 * len(batch))
             self._store.add(rows)
             self._note(batch)
             return
@@ -203,7 +203,8 @@ class _Run:
                 f"rows {rows} were lost {most} times, at last by {type(error).__name__}: {error}; "
                 f"finished rows are kept: look at the workers, then run again{guard}"
             ) from error
-        self._waiting.append((batch, attempts + 1))
+        size = _LOGS if self._joins else len(batch)
+        self._waiting.extend((batch[k : k + size], attempts + 1) for k in range(0, len(batch), size))
 
     def _note(self, finished: Iterable[Key]) -> None:
         """Report the number of rows, these included."""

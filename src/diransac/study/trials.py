@@ -62,7 +62,7 @@ def run_study(
     trials: int | None = None,
     levels: Sequence[str | float] | None = None,
     methods: Sequence[str] | None = None,
-    batch_size: int | None = None,
+    batch_size: int = 4,
     tasks: int | None = None,
     time_limit: float | None = None,
     progress: Progress | None = None,
@@ -78,7 +78,7 @@ def run_study(
         "__main__":``
     jobs : number of these processes; None: one per core
     trials, levels, methods : number of trials, levels, and labels of methods; None: those of the study
-    batch_size : trials of a level that are run together; None: four, or as many as take about a second
+    batch_size : trials of a level that are run together
     tasks : batches handed out at a time; None: two per process, 64 to an executor
     time_limit : time after which the run ends, s; rows that are done are kept, and the same call runs the others
     progress : called with (rows present, rows asked for) at the start and whenever rows are added

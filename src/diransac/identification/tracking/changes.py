@@ -334,7 +334,7 @@ class Changes:
             none = np.zeros(0)
             window.begin_with(then, 0, found.fits.stepped(0, step.changed[:0], none, larger).fit)
             self._pending, self._kept = [], None
-        elif found.over_rivals < -AS_LIKELY and self._firing > len(window):
+        elif found.over_rivals < -AS_LIKELY and self._firing * self.step > self._duration(window):
             self._usual = np.stack([np.log(larger.tau[-1]), larger.rho])
         elif found.over_usual > price and found.over_rivals > -price:
             self._doubt.undecided(window.fit.shared - step.fit.shared)

@@ -160,7 +160,7 @@ class LoDiransac(LoDiransacSettings):
             The time limit was reached before the first local optimisation had converged.
         """
         if not dataset.model.has_equations:
-            return estimated_by_simulation(self, dataset, seed, callback)
+            return estimated_by_simulation(self, dataset, int(seed), callback)
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
         with memory:
             return _fitted(self, dataset, int(seed), callback)
@@ -185,9 +185,9 @@ class LoDiransac(LoDiransacSettings):
         TimeLimitError
             The time limit was reached.
         """
-        try:
-            best = dataset.kept(_key(self, seed), _never_made)
-        except LookupError:  # the model has no equations
+        nothing: Searched | None = None
+        best = dataset.kept(_key(self, seed), lambda: nothing)
+        if best is None:  # the model has no equations
             return []
         with np.errstate(all="ignore"):  # as in the fit of all
             return estimates_alone(self, dataset, best, callback)
@@ -196,11 +196,6 @@ class LoDiransac(LoDiransacSettings):
 def _key(settings: LoDiransac, seed: int) -> tuple[object, ...]:
     """Key under which a dataset of several logs keeps the search of all of them."""
     return "search of all logs", settings, int(seed)
-
-
-def _never_made() -> Searched:
-    """Search of which a dataset has none.  Raises LookupError."""
-    raise LookupError
 
 
 def configured(settings: Settings, **options: Any) -> LoDiransac:
@@ -235,7 +230,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         check_structure(dataset.model, dataset.source, allowed, measured_signals(whole[0]), dataset.ranges)
     best = compete(settings, dataset, whole, seed, callback)
     if len(dataset.segments) > 1:
-        dataset.kept(_key(settings, seed), lambda: best)
+        dataset.keep(_key(settings, seed), best)
     likeliest, result, intervals, motion = best.likeliest, best.result, best.likeliest.intervals, best.motion
     refined = likeliest.refinement
     report(callback, "estimating parameters", 0.9)

@@ -88,7 +88,7 @@ def estimated_by_simulation(
         text = f"pass {k + 1}: negative log-likelihood {found.last.losses.sum():.6g}"
         report(callback, "prediction errors", 0.85 if ends else min(0.05 + 0.05 * k, 0.85), text)
 
-    predictor = Predictor.of(intervals, outliers=settings.outliers, free_delay=free)
+    predictor, limited = Predictor.of(intervals, outliers=settings.outliers, free_delay=free), False
     try:
         for start in _starts(dataset, begin, seed):
             ends.append(minimised(predictor, start, outliers=settings.outliers, progress=progress))
@@ -97,8 +97,9 @@ def estimated_by_simulation(
     except TimeLimitError:
         if not so_far:
             raise
-    found = min(ends or so_far, key=lambda end: float(end.last.losses.sum()))
-    ended = TIME_LIMIT if not ends else "converged" if found.converged else "limit of passes"
+        limited = True
+    found = min([*ends, *so_far] if limited else ends, key=lambda end: float(end.last.losses.sum()))
+    ended = TIME_LIMIT if limited else "converged" if found.converged else "limit of passes"
     if found.last.lost.sum() > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
             f"{dataset.source}: simulations diverge in most of the log from the file's values; correct these, or give "
@@ -114,12 +115,13 @@ def _follows(end: Minimum) -> bool:
 
 
 def _starts(dataset: Dataset, begin: FloatArray, seed: int) -> Iterator[FloatArray]:
-    """Starts ``(n,)``: one that is given, and further ones whose positive parameters are up to three times as large."""
+    """Starts ``(n,)``: one that is given, and further ones with a third to three times its positive parameters."""
     lower, upper = np.array([(x.lower, x.upper) for x in dataset.layout.bounds]).T
     positive = np.array([x.positive for x in dataset.layout.bounds]) | (lower >= 0.0)
     yield begin
-    for k in range(_MORE_STARTS):
-        factors = 3.0 ** np.random.default_rng([int(seed), k]).uniform(-1.0, 1.0, len(begin))
+    for k in range(_MORE_STARTS if (positive & (begin != 0.0)).any() else 0):
+        rng = np.random.default_rng([abs(seed), int(seed < 0), k])
+        factors = 3.0 ** rng.uniform(-1.0, 1.0, len(begin))
         yield np.clip(np.where(positive, factors, 1.0) * begin, lower, upper)
 
 
@@ -271,7 +273,7 @@ class _Found:
             diagnosis_of(self.dataset, one, fitted, unmodelled, (lost, tuple(map(_untold, lost)))),
             input_delay=predictor.delay * one.dt,
             input_delay_error=delay_error * one.dt,
-            input_delay_significant=bool(self._delay(delay_error)),
+            input_delay_significant=abs(predictor.delay) > max(_LEAST_DELAY, 3.0 * delay_error),
         )
 
 
