@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 _PASSES, _CONVERGED, _LEAST_REACH, _LIKELIER = 30, 0.5, 0.1, 1.0
 """Passes at most; mean step of the parameters, standard errors, over the latest passes, that ends them; part of a step
 below which none leads anywhere; difference of losses, nats, that counts."""
-LACKING = 0.1
-"""Part of each change of velocity that a model lacks where its motion is another one; a fit does not end there."""
 _LATEST = 4
 """Passes that tell whether a fit has ended, and how far an estimate wanders from pass to pass."""
 _SETTLING = 4
@@ -106,8 +104,7 @@ def minimised(
         if progress is not None:
             progress(k, Minimum(predictor, p, now, False, latest.covariance()))
         is_last = reach < _LEAST_REACH
-        follows = not held and predictor.lacks <= LACKING
-        converged = follows and latest.are_at_rest(1.0 if is_last else _CONVERGED)
+        converged = not held and latest.are_at_rest(1.0 if is_last else _CONVERGED)
         if converged or is_last:
             break
         then, moved = _moved(following, p, reach * step)

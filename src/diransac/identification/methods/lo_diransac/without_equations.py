@@ -20,7 +20,7 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.diagnosing import diagnosis_of
 from diransac.identification.methods.lo_diransac.following import Predictor
-from diransac.identification.methods.lo_diransac.prediction_error import LACKING, Minimum, minimised, settled
+from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
 from diransac.identification.regression.uncertainty import CLEAR
 
@@ -39,7 +39,8 @@ _USED = (
     "input_delay", "start",
 )  # fmt: skip
 """Settings that are used without equations."""
-_MORE_STARTS = 3
+_LACKING, _MORE_STARTS = 0.1, 3
+"""Part of each change of velocity that a model lacks where its motion is another one; starts from elsewhere then."""
 _LEAST_DELAY = 0.05
 """Delay, samples, that is none."""
 _OUTLIER, _GAUSSIAN = 0.5, 10_000
@@ -110,7 +111,7 @@ def estimated_by_simulation(
 def _follows(end: Minimum) -> bool:
     """True unless a fit lacks much of the motion, or takes most samples of a state for outliers."""
     n_x = len(end.predictor.intervals.model.state)
-    return end.predictor.lacks <= LACKING and bool((end.predictor.noise.pi[:n_x] <= _OUTLIER).all())
+    return end.predictor.lacks <= _LACKING and bool((end.predictor.noise.pi[:n_x] <= _OUTLIER).all())
 
 
 def _starts(dataset: Dataset, begin: FloatArray, seed: int) -> Iterator[FloatArray]:
@@ -250,7 +251,7 @@ class _Found:
                 f"The inputs seem to act {1e3 * early * self.dataset.dt:.2g} ms before they are recorded",
                 "check their clock, begin closer, with start= or --start, or give input_delay=False",
             )
-        if self.found.predictor.lacks > LACKING:
+        if self.found.predictor.lacks > _LACKING:
             yield Finding(
                 "bad",
                 f"The model lacks {100.0 * self.found.predictor.lacks:.0f} % of each change of velocity",
