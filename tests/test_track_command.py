@@ -167,7 +167,7 @@ def test_a_terminal_shows_the_newest_estimate_in_a_line_and_nothing_else_does(mo
     shown = run(*TRACK)
     assert plain.stderr == ""
     lines = [x for x in shown.stderr.split("\r\x1b[2K") if x.startswith("t ")]
-    assert re.match(r"t 4\.0 s  mass \d+(\.\d+)? ± \S+ kg  linear_drag ", lines[-1])
+    assert re.match(r"t 4\.0 s  mass \d+(\.\d+)? ± \d+(\.\d+)?(×10⁻\S+)? kg  linear_drag ", lines[-1])
     assert all(len(x.splitlines()[0]) <= 80 for x in lines)
     assert shown.stdout == plain.stdout
     assert run("-q", *TRACK).stderr == ""

@@ -113,8 +113,8 @@ class LogEstimate:
     parameters, standard_errors : mapping of str to float
         Each parameter, in its unit; its standard error is infinite where the log does not tell it.
     input_delay, input_delay_error : float, optional
-        Delay of the inputs, s, beyond that of an estimate of all logs, and its standard error; infinite where it is not
-        estimated.
+        Delay of the inputs, s, all of it or, by simulation error, what exceeds that of all logs; its standard error is
+        infinite where it is not estimated.
     degrees_of_freedom : int, optional
         Of the standard errors.
     """
