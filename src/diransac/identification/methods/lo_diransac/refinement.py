@@ -19,7 +19,6 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -64,8 +63,8 @@ _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 _MAX_SWEEPS = 12
 # Change of an error of a recording over its standard error that ends a fit.
 _ERRORS_SETTLED = 0.1
-# Steps of which the best says how much a fit may gain in each of those that are left.
-_RECENT = 6
+# Steps after which a fit that is a nat in every sample behind its rival is lost; it may be further behind before.
+_PATIENCE = 20
 
 
 @dataclass(frozen=True)
@@ -295,8 +294,7 @@ def refine_exact(
         Initial fit, as from `refine`.
     prior : Prior
     rival : float, optional
-        Cost of a fit to which this one is an alternative: it ends where as many steps as are left, each as good as the
-        best of the last few, and a nat more in every sample would leave it behind.
+        Cost of a fit to which this one is an alternative: it ends where it is far behind, the sooner the further.
 
     Returns
     -------
@@ -314,13 +312,13 @@ def refine_exact(
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    at, losses = linearized(intervals, fit), list[float]()
-    while steps < settings.max_steps and not converged and not _is_lost(intervals, losses, settings, rival):
+    at, behind = linearized(intervals, fit), -np.inf
+    while steps < settings.max_steps and not converged and not _is_lost(intervals, behind, steps):
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
         intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
-        losses.append(float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()))
+        behind = float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()) - rival
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
@@ -335,13 +333,9 @@ def refine_exact(
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
 
-def _is_lost(intervals: ShootingIntervals, losses: Sequence[float], settings: LoDiransacSettings, rival: float) -> bool:
-    """True if the losses after each step so far leave a fit behind its rival for good."""
-    if len(losses) <= _RECENT:
-        return False
-    best = max(-np.diff(losses[-_RECENT:]).min(), 0.0)
-    left = settings.max_steps - len(losses)
-    return bool(losses[-1] - rival > intervals.known.sum() + left * best)
+def _is_lost(intervals: ShootingIntervals, behind: float, steps: int) -> bool:
+    """True if a fit whose loss is so far behind its rival's cost after some steps stays behind it."""
+    return bool(behind > max(1.0, _PATIENCE / max(steps, 1)) * intervals.known.sum())
 
 
 def _evidence(at: JointEquations) -> float:
