@@ -405,7 +405,7 @@ def test_a_sensor_that_the_log_lacks_is_refused_by_name():
         estimate(pendulum_log(), gain_drifts=("angle",))
 
 
-def test_a_search_that_is_behind_before_errors_of_recordings_tries_none():
+def test_a_search_ends_where_another_began_as_likely_or_is_ahead_before_errors_of_recordings():
     log = pendulum_log()
     late = {"angle_ddot": np.r_[np.full(3, np.nan), log["angle_ddot"][:-3]]}
     signals = {name: log[name] for name in ("angle", "angle_dot", "torque")} | late
@@ -416,10 +416,11 @@ def test_a_search_that_is_behind_before_errors_of_recordings_tries_none():
     assert found.cost < found.cost_before_errors - 100.0
 
     def beside(ahead):
-        rival = replace(found, cost_before_errors=found.cost_before_errors - ahead)
+        rival = replace(found, first_cost=np.inf, cost_before_errors=found.cost_before_errors - ahead)
         return searched(settings, *whole, 0, dataset, None, rival=rival).likeliest
 
     assert beside(4.0).cost == found.cost
     behind = beside(6.0)
     assert behind.cost == found.cost_before_errors
     assert not behind.intervals.all_errors.kinds
+    assert searched(settings, *whole, 0, dataset, None, rival=found).likeliest is found

@@ -70,13 +70,15 @@ class Explanation:
         Whether the fit is one of the model as it is.
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
-    cost_before_errors : float, optional
-        Cost of the likeliest explanation, with errors of the recordings that settings name, before others were sought.
+    first_cost, cost_before_errors : float, optional
+        Costs of the first fit of its search, and of the likeliest explanation, with errors of the recordings that
+        settings name, before others were sought.
     """
 
     refinement: Refinement
     exact: bool
     complete: bool = True
+    first_cost: float = np.inf
     cost_before_errors: float = np.inf
 
     @property
@@ -136,7 +138,8 @@ class LocalSearch:
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
         rival : Explanation, optional
-            Outcome of another search.  Where it was likelier before errors of the recordings were sought, this search
+            Outcome of another search.  It is that of this one, too, where the first fits of both are as likely: what
+            follows would be the same.  Where it was likelier before errors of the recordings were sought, this search
             ends there.
 
         Returns
@@ -167,18 +170,22 @@ class LocalSearch:
     ) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
+        flexible = replace(flexible, first_cost=flexible.cost)
         yield self._shown(flexible, 0.35)
+        if rival is not None and abs(flexible.cost - rival.first_cost) < AS_LIKELY:
+            yield rival
+            return
         best = self._accurate(self._simplest(flexible))
         yield self._shown(best, 0.6)
         named = self._named(intervals)
         if named:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
-        before = best.cost
-        yield replace(best, cost_before_errors=before)
-        if rival is not None and before > rival.cost_before_errors + AS_LIKELY:
+        best = replace(best, cost_before_errors=best.cost)
+        yield best
+        if rival is not None and best.cost > rival.cost_before_errors + AS_LIKELY:
             return
         for k, found in enumerate(self._with_more_errors(best, free_hold=free_hold)):
-            yield self._shown(replace(found, cost_before_errors=before), 0.6 + 0.03 * k)
+            yield self._shown(found, 0.6 + 0.03 * k)
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""
@@ -376,23 +383,24 @@ class LocalSearch:
         if not intervals.layout.admits(flexible.projected[None])[0]:
             return None
         begin = replace(fit, shared=np.concatenate([flexible.projected, fit.shared[intervals.n_p :]]))
-        exact = self._exact(intervals, begin, flexible.cost)
+        exact = self._exact(intervals, begin, flexible)
         if exact is None or exact.cost <= flexible.cost or late in exact.intervals.all_errors.kinds:
             return exact
-        also = self._exact(intervals.with_errors([late]), begin, flexible.cost) if late in self._sought(exact) else None
+        also = self._exact(intervals.with_errors([late]), begin, flexible) if late in self._sought(exact) else None
         return exact if also is None else min(exact, also, key=lambda x: x.cost)
 
-    def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: float) -> Explanation | None:
+    def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: Explanation) -> Explanation | None:
         """The exact model from a motion, with all integration steps: it is one simulation of the whole log.
 
         None if simulations overflow from there.
         """
         intervals = replace(intervals, substeps=self.settings.substeps)
         try:
-            refined = refine_exact(self.settings, intervals, with_residuals(intervals, begin), self.prior, rival)
+            begin = with_residuals(intervals, begin)
+            refined = refine_exact(self.settings, intervals, begin, self.prior, rival.cost)
         except np.linalg.LinAlgError:
             return None
-        return Explanation(refined, exact=True)
+        return replace(rival, refinement=refined, exact=True)
 
     def _split(self, coarse: Explanation, parts: int) -> Explanation:
         """The fit with unmodelled accelerations that vary faster."""

@@ -189,8 +189,8 @@ def likeliest(
         while not best.likeliest.exact and (sensors := best.corrected(intervals)).all_errors.kinds != tried:
             observed, tried = with_observed_states(sensors, motion), sensors.all_errors.kinds
             if observed is not None:
-                further = within(callback, 0.87, 0.9)
-                other = searched(settings, sensors, observed, notes, seed, dataset, further)
+                further, rival = within(callback, 0.87, 0.9), best.likeliest
+                other = searched(settings, sensors, observed, notes, seed, dataset, further, rival=rival)
                 best = min(best, other, key=lambda x: x.likeliest.cost)
     except TimeLimitError:
         return replace(best, likeliest=replace(best.likeliest, complete=False))
