@@ -223,10 +223,12 @@ def test_slopes_are_differences_of_rollouts(four_bar: tuple[Path, dr.Log]) -> No
     nothing = Measurements(np.zeros((n, len(model.signals))), np.ones(n, bool))
     simulator = rollouts(model)
     found = simulator.linearized_errors(batch, nothing)
-    sums = simulator.gauss_newton(batch, nothing, np.ones(len(model.signals)))
+    d = np.linspace(-1.0, 1.0, n * len(model.signals)).reshape(n, 1, -1)
+    sums = simulator.gauss_newton(batch, nothing, np.ones(len(model.signals)), directions=d)
     J = found.jacobian.reshape(-1, len(found.unknowns))
     np.testing.assert_allclose(sums.normal_matrix[0], J.T @ J, rtol=1e-9)
     np.testing.assert_allclose(sums.gradient[0], J.T @ found.errors.ravel(), rtol=1e-9)
+    np.testing.assert_allclose(sums.along[0, 0, 1:], J.T @ d.ravel(), rtol=1e-9)
     for j in range(len(p)):
         step = 1e-4 * p[j] * np.eye(len(p))[j]
         both = RolloutBatch(np.array([p + step, p - step]), model.home, batch.inputs, 0.002)

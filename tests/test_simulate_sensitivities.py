@@ -48,11 +48,11 @@ def linearised(engine, task, parameters=None, *, unknowns=None, threads=1, **row
     return engine.linearized_errors(batch, measurements_of(engine, task), unknowns=unknowns, threads=threads)
 
 
-def sums_of(engine, task, parameters=None, weights=None, *, unknowns=None, threads=1, **rows):
+def sums_of(engine, task, parameters=None, weights=None, *, unknowns=None, directions=None, threads=1, **rows):
     """Gauss-Newton sums of a problem."""
     w = np.linspace(0.5, 2.0, len(engine.signals)) if weights is None else weights
-    batch = batch_of(task, parameters, **rows)
-    return engine.gauss_newton(batch, measurements_of(engine, task), w, unknowns=unknowns, threads=threads)
+    problem, options = (batch_of(task, parameters, **rows), measurements_of(engine, task), w), {"threads": threads}
+    return engine.gauss_newton(*problem, unknowns=unknowns, directions=directions, **options)
 
 
 def differences(engine, model, p, x, inputs, dt, step=1e-6):
@@ -183,8 +183,9 @@ def test_sums_are_those_of_the_linearised_errors(signals):
     task = log_of(BODY, 50)
     engine = rollouts(BODY, signals)
     n_s = len(engine.signals)
-    weights = np.random.default_rng(1).uniform(0, 3, (50, n_s))
-    sums, rows = sums_of(engine, task, weights=weights), linearised(engine, task)
+    rng = np.random.default_rng(1)
+    weights, d = rng.uniform(0, 3, (50, n_s)), rng.standard_normal((50, 3, n_s))
+    sums, rows = sums_of(engine, task, weights=weights, directions=d), linearised(engine, task)
     W = np.where(task.valid[:, None], weights, 0.0)
     e, J = rows.errors, rows.jacobian
     np.testing.assert_allclose(sums.cost, np.einsum("lrs,rs,lrs->l", e, W, e), rtol=1e-13)
@@ -192,6 +193,8 @@ def test_sums_are_those_of_the_linearised_errors(signals):
     expected = np.einsum("lrsi,rs,lrsj->lij", J, W, J)
     np.testing.assert_allclose(sums.normal_matrix, expected, rtol=1e-11, atol=1e-11)
     np.testing.assert_array_equal(sums.normal_matrix, sums.normal_matrix.swapaxes(1, 2))
+    along = np.einsum("lrsi,rs,rds->ldi", np.concatenate([e[..., None], J], axis=3), W, d)
+    np.testing.assert_allclose(sums.along, along, rtol=1e-10, atol=1e-10)
 
 
 def test_sums_are_made_of_the_very_bits_of_the_linearised_errors():
@@ -341,12 +344,13 @@ def test_a_diverged_lane_costs_infinitely_and_adds_nothing():
     p = np.tile([[2.0, 0.1]], (24, 1))
     p[3], p[20] = [-1.0, 0.1], [-2.0, 0.1]
     engine = rollouts(EXPLOSIVE)
-    found = sums_of(engine, task, p)
+    found = sums_of(engine, task, p, directions=np.ones((300, 1, len(engine.signals))))
     np.testing.assert_array_equal(found.diverged, score_of(engine, task, p).diverged)
     np.testing.assert_array_equal(np.flatnonzero(~found.diverged), [3, 20])
     np.testing.assert_array_equal(np.isinf(found.cost), found.diverged)
     assert not found.gradient[found.diverged].any()
     assert not found.normal_matrix[found.diverged].any()
+    assert not found.along[found.diverged].any()
     assert np.isnan(found.final_states[found.diverged]).all()
     assert np.isnan(found.final_slopes[found.diverged]).all()
     for lane in (3, 20):

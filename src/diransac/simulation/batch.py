@@ -283,6 +283,8 @@ class GaussNewtonBatch:
         d(final state)/dz; NaN in a lane that diverged.
     diverged : (n_lanes,)
         Lanes in which a signal, a derivative of the final state or a sum became infinite or NaN.
+    along : (n_lanes, n_directions, 1 + n_z)
+        e' W d and J' W d of each direction d; zero in a lane that diverged.
     """
 
     unknowns: tuple[str, ...]
@@ -292,6 +294,7 @@ class GaussNewtonBatch:
     final_states: FloatArray
     final_slopes: FloatArray
     diverged: BoolArray
+    along: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,6 +422,7 @@ class Simulator(Protocol):
         *,
         unknowns: Sequence[str] | None = None,
         normal_matrix: bool = True,
+        directions: ArrayLike | None = None,
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums e' W e, J' W e and J' W J of every lane, J the exact derivative of the errors that `errors` returns.
@@ -437,6 +441,8 @@ class Simulator(Protocol):
             Names of parameters, and of states for their initial values; by default all parameters, then all states.
         normal_matrix : bool, optional
             False leaves out J' W J, which takes most of the time.
+        directions : (n_log, n_directions, n_s), optional
+            d of e' W d and J' W d.
         threads : int
             Number of threads.
         """

@@ -106,6 +106,7 @@ class MujocoRollouts(Simulator):
         *,
         unknowns: Sequence[str] | None = None,
         normal_matrix: bool = True,
+        directions: ArrayLike | None = None,
         threads: int = 1,
     ) -> GaussNewtonBatch:
         """Sums of every lane, from differences; see `Simulator.gauss_newton`."""
@@ -114,6 +115,8 @@ class MujocoRollouts(Simulator):
         W = np.broadcast_to(np.asarray(weights, float), measurements.values.shape)
         known = Measurements(np.nan_to_num(measurements.values), measurements.valid)
         cost, gradient = np.empty(n), np.empty((n, n_z))
+        d = np.asarray(np.empty((len(W), 0, W.shape[1])) if directions is None else directions, float)
+        along = np.empty((n, d.shape[1], 1 + n_z))
         matrix = np.empty((n if normal_matrix else 0, n_z, n_z))
         final, slopes = np.empty((n, n_x)), np.empty((n, n_x, n_z))
         for part in _parts(n, max(1, _LANES // (n_z + 1))):
@@ -125,13 +128,16 @@ class MujocoRollouts(Simulator):
                 cost[part] = (weighted[..., 0] * errors).sum(axis=(1, 2))
                 flat = jacobian.reshape(len(errors), -1, n_z)
                 gradient[part] = (flat.swapaxes(1, 2) @ weighted.reshape(len(errors), -1, 1))[..., 0]
+                beside = np.concatenate([errors[..., None], jacobian], axis=3)
+                along[part] = np.einsum("nrs,nrds,nrsz->ndz", w, d[rows], beside)
                 if normal_matrix:
                     matrix[part] = flat.swapaxes(1, 2) @ (w.reshape(len(errors), -1, 1) * flat)
         diverged = ~(np.isfinite(cost) & np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1))
         cost[diverged], gradient[diverged], slopes[diverged], final[diverged] = np.inf, 0.0, np.nan, np.nan
+        along[diverged] = 0.0
         if normal_matrix:
             matrix[diverged] = 0.0
-        return GaussNewtonBatch(names, cost, gradient, matrix, final, slopes, diverged)
+        return GaussNewtonBatch(names, cost, gradient, matrix, final, slopes, diverged, along)
 
     def linearized_errors(
         self,

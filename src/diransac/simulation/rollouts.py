@@ -28,6 +28,7 @@ from diransac.simulation.compiler.lanes import (
     ARGUMENTS,
     Lanes,
     aligned,
+    arranged_directions,
     arranged_feedback,
     arranged_lanes,
     arranged_measurements,
@@ -219,18 +220,23 @@ class Rollouts(Simulator):
         *,
         unknowns: Sequence[str] | None = None,
         normal_matrix: bool = True,
+        directions: ArrayLike | None = None,
         threads: int = 1,
     ) -> GaussNewtonBatch:
-        """Sums e' W e, J' W e and J' W J of every lane; see `Simulator.gauss_newton`."""
+        """Sums e' W e, J' W e, J' W J and those along directions of every lane; see `Simulator.gauss_newton`."""
         lanes = self._lanes(batch)
         names, sensitivities = self._unknowns(unknowns)
         n, n_x, n_z = lanes.n_lanes, len(self._model.state), len(names)
         first, matrix = np.empty((n, 1 + n_z)), np.empty((n if normal_matrix else 0, n_z, n_z))
         final = np.zeros((n, n_x + n_x * n_z))  # derivatives that are always zero are not written
         places = sensitivities.places
-        n_vectors = len(places) - n_z * (n_z + 1) // 2
+        of_directions = arranged_directions(lanes, len(self.signals), directions)
+        along = np.empty((n, of_directions["n_directions"], 1 + n_z))
+        n_vectors = len(places) - n_z * (n_z + 1) // 2 + along.shape[1] * along.shape[2]
         values = {
             **arranged_weights(lanes, len(self.signals), measurements.values, measurements.valid, weights),
+            **of_directions,
+            "along": along,
             "products": int(normal_matrix),
             "places": places,
             "scratch": aligned((lanes.n_padded // LANES, n_vectors, LANES)),
@@ -243,7 +249,7 @@ class Rollouts(Simulator):
         diverged = np.isinf(cost)
         if diverged.any():
             slopes[diverged] = np.nan
-        return GaussNewtonBatch(names, cost, first[:, 1:], matrix, final[:, :n_x].copy(), slopes, diverged)
+        return GaussNewtonBatch(names, cost, first[:, 1:], matrix, final[:, :n_x].copy(), slopes, diverged, along)
 
     def linearized_errors(
         self,

@@ -28,12 +28,14 @@ ARGUMENTS = {
     "measured": "pointer",  # (n_log, n_s) float64
     "valid": "pointer",  # (n_log,) bytes, 0 or 1
     "weights": "pointer",  # (n_log, n_s) float64
+    "directions": "pointer",  # (n_log, n_directions, n_s) float64
     "squared_thresholds": "pointer",  # (n_s,) float64
     "start_rows": "pointer",  # (n_padded,) int64, read where lanes start at different rows
     "places": "pointer",  # int64, of sums and final states in the arrays of a lane; see `Sensitivities.places`
     "scratch": "pointer",  # float64, vectors of a block, for every block
-    "sums": "pointer",  # (n_s, n_padded) float64, written by the output; so are the next six
+    "sums": "pointer",  # (n_s, n_padded) float64, written by the output; so are the next seven
     "first": "pointer",  # (n_lanes, 1 + n_z) float64
+    "along": "pointer",  # (n_lanes, n_directions, 1 + n_z) float64
     "matrix": "pointer",  # (n_lanes, n_z, n_z) float64
     "counts": "pointer",  # (2, n_padded) int64
     "inlier_bits": "pointer",  # (n_blocks, n_rows) bytes, one bit per lane
@@ -43,6 +45,7 @@ ARGUMENTS = {
     "substeps": "integer",  # of a row, read where rows are divided
     "min_inlier_signals": "integer",
     "products": "integer",  # 0 leaves out J' W J
+    "n_directions": "integer",
     "n_lanes": "integer",
     "n_padded": "integer",  # n_lanes rounded up to whole vectors; the last lane is repeated
     "n_rows": "integer",
@@ -182,6 +185,20 @@ def arranged_weights(
             "weight to 0, or mark the row as not valid."
         )
     return {"measured": np.where(finite, y, 0.0), "weights": w}
+
+
+def arranged_directions(lanes: Lanes, n_signals: int, directions: ArrayLike | None) -> dict[str, Any]:
+    """Directions (n_window, n_directions, n_signals), none by default, and their number.
+
+    Parameters
+    ----------
+    directions : (n_log, n_directions, n_signals)
+
+    Raises SettingsError: an array does not fit the lanes.
+    """
+    d = np.empty((lanes.n_log, 0, n_signals)) if directions is None else directions
+    d = checked_array("directions", d, (lanes.n_log, None, n_signals))[lanes.window]
+    return {"directions": d, "n_directions": d.shape[1]}
 
 
 def arranged_feedback(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING
@@ -104,6 +106,8 @@ class ScoreOutput(Output):
 class GaussNewtonOutput(Output):
     """`first` (n_lanes, 1 + n_z) of e'we and J'we, `matrix` (n_lanes, n_z, n_z) of J'wJ, and `final` states.
 
+    `along` (n_lanes, n_directions, 1 + n_z) has e'wd and J'wd of directions d of the errors.
+
     The sums exceed the registers: each is loaded, increased and stored, close together for a block, with unknowns in
     the order of their groups.  At its end they go to their `places`.  `final` (n_lanes, n_states (1 + n_z)) is the
     state, then its derivatives without those that are always zero.  In a lane that diverged e'we is infinite, the other
@@ -126,12 +130,15 @@ class GaussNewtonOutput(Output):
 
     def start(self, block: Block) -> None:
         """Set the sums to zero; all blocks of a call have the same memory, which stays in the cache."""
-        builder, width = self.loop.builder, self.n_sums + self.n_final
-        start = builder.mul(self.arguments["first_block"], integer(LANES * width))
+        builder, v, n_first = self.loop.builder, self.v, 1 + self.n_z
+        n_along = builder.mul(self.arguments["n_directions"], integer(n_first))
+        width = builder.add(n_along, integer(self.n_sums + self.n_final))
+        start = builder.mul(self.arguments["first_block"], builder.mul(width, integer(LANES)))
         self.sums = builder.gep(self.arguments["scratch"], [start], source_etype=DOUBLE)
         self.final = builder.gep(self.sums, [integer(LANES * self.n_sums)], source_etype=DOUBLE)
-        for array, size in ((self.sums, self.n_sums), (self.weighted, self.n_weighted)):
-            self.v.each(0, size, partial(self.v.put, self.v.number(0.0), array))
+        self.along = builder.gep(self.final, [integer(LANES * self.n_final)], source_etype=DOUBLE)
+        for array, size in ((self.sums, self.n_sums), (self.weighted, self.n_weighted), (self.along, n_along)):
+            v.each(0, size, partial(v.put, v.number(0.0), array))
 
     def row(self, block: Block, row: LoopRow) -> None:
         """Add a row to the sums."""
@@ -139,9 +146,11 @@ class GaussNewtonOutput(Output):
         errors = self.errors(block, row)
         weights = self.loop.logged("weights", len(errors), block, row.index)
         weighted = [v.mul(w, e) for w, e in zip(weights, errors, strict=True)]
-        self._add(0, list(zip(weighted, errors, strict=True)))
+        self._add(self.sums, 0, list(zip(weighted, errors, strict=True)))
         for number in range(len(self.columns.groups)):
             self._add_gradient(number, weights, weighted)
+        with self._directions() as direction:
+            self._add_along(direction, block, row, weighted)
         with self.loop.builder.if_then(self._wants_products):
             for number in range(len(self.columns.groups)):
                 self._add_products(number)
@@ -157,9 +166,24 @@ class GaussNewtonOutput(Output):
                 slope = v.pick(self.columns.slopes[number], v.affine(column, len(group.signals), k))
                 v.put(v.mul(weights[signal], slope), self.weighted, v.affine(unknown, len(weights), signal))
                 products.append((slope, weighted[signal]))
-            self._add(v.affine(unknown, 1, 1), products)
+            self._add(self.sums, v.affine(unknown, 1, 1), products)
 
         v.each(0, len(group.unknowns), add)
+
+    def _add_along(self, direction: Value, block: Block, row: LoopRow, weighted: list[Value]) -> None:
+        """Add a row's e'wd and J'wd of a direction d."""
+        v, builder = self.v, self.loop.builder
+        rows = [builder.mul(at, self.arguments["n_directions"]) for at in self.loop.rows_at(block, row.index)]
+        d = self.loop.columns_at("directions", len(weighted), [builder.add(at, direction) for at in rows])
+        first = v.affine(direction, 1 + self.n_z)
+        self._add(self.along, first, list(zip(weighted, d, strict=True)))
+
+        def add(unknown: Value | int) -> None:
+            slopes = [v.pick(self.weighted, v.affine(unknown, len(d), k)) for k in range(len(d))]
+            place = v.affine(unknown, 1, v.affine(first, 1, 1))
+            self._add(self.along, place, list(zip(slopes, d, strict=True)))
+
+        v.each(0, self.n_z, add)
 
     def _add_products(self, number: int) -> None:
         """Add a row's J'wJ of the columns of a group with themselves and with all that follow.
@@ -178,7 +202,7 @@ class GaussNewtonOutput(Output):
 
             def add_pair(right: Value | int) -> None:
                 weighted = (v.pick(self.weighted, v.affine(right, n_signals, signal)) for signal in group.signals)
-                self._add(v.affine(right, 1, line), list(zip(slopes, weighted, strict=True)))
+                self._add(self.sums, v.affine(right, 1, line), list(zip(slopes, weighted, strict=True)))
 
             v.each(left, self.n_z, add_pair)
 
@@ -192,12 +216,12 @@ class GaussNewtonOutput(Output):
         twice = builder.mul(unknown, builder.sub(integer(2 * self.n_z - 1), unknown))
         return builder.add(builder.ashr(twice, integer(1)), integer(1 + self.n_z))
 
-    def _add(self, place: Value | int, products: list[tuple[Value, Value]]) -> None:
-        """Add products, one per signal, to a sum."""
-        total = self.v.pick(self.sums, place)
+    def _add(self, sums: Value, place: Value | int, products: list[tuple[Value, Value]]) -> None:
+        """Add products, one per signal, to one of some sums."""
+        total = self.v.pick(sums, place)
         for x, y in products:
             total = self.v.fma(x, y, total)
-        self.v.put(total, self.sums, place)
+        self.v.put(total, sums, place)
 
     def end(self, block: Block) -> None:
         """Write the sums and the final state; mark lanes in which anything is not finite."""
@@ -209,7 +233,8 @@ class GaussNewtonOutput(Output):
             size = len(group.unknowns) * len(group.rows)
             v.each(0, size, partial(self._copy, state, final, first))
             first += size
-        written = [(self.sums, self.n_sums, 0.0), (final, self.n_final, float("nan"))]
+        n_along = builder.mul(self.arguments["n_directions"], integer(1 + self.n_z))
+        written = [(self.sums, self.n_sums, 0.0), (final, self.n_final, float("nan")), (self.along, n_along, 0.0)]
         for array, size, _ in written:
             v.each(0, size, partial(self._guard, array))
         diverged = v.is_nan(v.get(guard))
@@ -220,16 +245,21 @@ class GaussNewtonOutput(Output):
         n_first, n_z = 1 + self.n_z, self.n_z
         n_pairs, lanes = self.n_sums - n_first, self.lanes(block)
         self._place(lanes, "first", n_first, (self.sums, 0, n_first), 0)
+        with self._directions() as direction:
+            rows = [builder.add(builder.mul(lane, self.arguments["n_directions"]), direction) for lane in lanes]
+            self._place(rows, "along", n_first, (self.along, v.affine(direction, n_first), n_first), 0)
         with builder.if_then(self._wants_products):
             for k in range(2):
                 self._place(lanes, "matrix", n_z * n_z, (self.sums, n_first, n_pairs), n_first + k * n_pairs)
         width = self.specification.n_states * n_first
         self._place(lanes, "final", width, (final, 0, self.n_final), n_first + 2 * n_pairs)
 
-    def _place(self, lanes: list[Value], name: str, width: int, source: tuple[Value, int, int], first: int) -> None:
-        """Copy vectors, some of an array from one on, to their places in an array (n_lanes, width)."""
+    def _place(
+        self, at: list[Value], name: str, width: int, source: tuple[Value, Value | int, int], first: int
+    ) -> None:
+        """Copy vectors, some of an array from one on, to their places in rows of an array (n_rows, width)."""
         v, builder, (array, start, size) = self.v, self.loop.builder, source
-        rows = [builder.mul(lane, integer(width)) for lane in lanes]
+        rows = [builder.mul(row, integer(width)) for row in at]
 
         def place(index: Value | int) -> None:
             vector = v.pick(array, v.affine(index, 1, start))
@@ -239,6 +269,12 @@ class GaussNewtonOutput(Output):
                 v.store(v.lane(vector, lane), self.arguments[name], builder.add(row, column))
 
         v.each(0, size, place)
+
+    @contextmanager
+    def _directions(self) -> Iterator[Value]:
+        """Emit a loop over the directions; the context is its body."""
+        with self.v.repeat(integer(0), self.arguments["n_directions"]) as loop:
+            yield loop.index
 
     @property
     def _wants_products(self) -> Value:

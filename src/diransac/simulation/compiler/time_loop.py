@@ -280,9 +280,16 @@ class TimeLoop:
         return v.compare("==", guard, v.number(0.0))
 
     def logged(self, name: str, width: int, block: Block, row: Value, kind: Value = DOUBLE) -> list[Value]:
-        """Return the columns of a logged array at a row; one load for all lanes if they share their row."""
-        v, builder = self.v, self.builder
-        at = [builder.add(start, row) for start in block.starts] or [row]
+        """Return the columns of a logged array at a row."""
+        return self.columns_at(name, width, self.rows_at(block, row), kind)
+
+    def rows_at(self, block: Block, row: Value) -> list[Value]:
+        """Rows of the log of all lanes; one if they share it."""
+        return [self.builder.add(start, row) for start in block.starts] or [row]
+
+    def columns_at(self, name: str, width: int, at: list[Value], kind: Value = DOUBLE) -> list[Value]:
+        """Return the columns of an array at a row of each lane; one load for all lanes if they share it."""
+        v = self.v
         rows = [v.row(self.arguments[name], place, width, kind) for place in at]
         columns = [[v.load(place, integer(k), kind) for place in rows] for k in range(width)]
         return [v.join(column) if self.windows else v.splat(*column) for column in columns]

@@ -313,12 +313,13 @@ class Vectors:
         terms = (integer(term) if isinstance(term, int) else term for term in (product, offset))
         return self.builder.add(*terms)
 
-    def each(self, first: Value | int, end: int, emit: Callable[[Value | int], None]) -> None:
+    def each(self, first: Value | int, end: Value | int, emit: Callable[[Value | int], None]) -> None:
         """Emit `emit(index)` in a loop over every index from `first` to before `end`; without a loop if it is one."""
-        if isinstance(first, int) and end - first == 1:
+        if isinstance(first, int) and isinstance(end, int) and end - first == 1:
             emit(first)
             return
-        with self.repeat(integer(first) if isinstance(first, int) else first, integer(end)) as loop:
+        ends = (integer(x) if isinstance(x, int) else x for x in (first, end))
+        with self.repeat(*ends) as loop:
             emit(loop.index)
 
     # Control -------------------------------------------------------------------------------------------------------

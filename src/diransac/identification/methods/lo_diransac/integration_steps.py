@@ -13,7 +13,6 @@ import numpy as np
 
 from diransac.identification.methods.lo_diransac.gauss_newton import after_step
 from diransac.identification.methods.lo_diransac.normal_equations import (
-    data_gradient,
     linearize,
     weights_of,
     with_residuals,
@@ -65,9 +64,10 @@ def _answer(intervals: ShootingIntervals, at: NormalEquations, fit: Fit, changed
     """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats."""
     own = changed.residuals - fit.residuals
     jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - changed.ends[:-1], 0.0)
-    z, s = data_gradient(intervals, fit, at.weights, intervals.measured - own)
+    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights, directions=[own], normal_matrix=False)
+    z, s = at.by_residuals(intervals, sums.along[:, 0])
     by_jumps_z, by_jumps_s = at.by_jumps(intervals, jumps)
-    right_z, right_s = z - at.data_z - by_jumps_z, (s - at.data_s).sum(axis=0) - by_jumps_s
+    right_z, right_s = -z - by_jumps_z, -s - by_jumps_s
     step = at.system.solve(right_z, right_s)
     cost = (at.weights * own * (fit.residuals + 0.5 * own)).sum()
     cost += (at.precision * jumps * (at.jumps + 0.5 * jumps)).sum()

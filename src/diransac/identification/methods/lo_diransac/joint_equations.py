@@ -21,7 +21,6 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.normal_equations import (
-    data_gradient,
     linearize,
     weights_of,
     with_residuals,
@@ -119,7 +118,10 @@ class _Slope:
         Of the jumps from interval to interval.
     of_z, of_s : (W, k) and (n_s,) array
         Of the gradient of the fit.
-    score : float
+    rows : (W,) array
+        Of the cost of each interval's measurements.
+    of_jumps : float
+        Of the cost of the jumps.
     """
 
     kind: ErrorKind
@@ -127,27 +129,41 @@ class _Slope:
     jumps: FloatArray
     of_z: FloatArray
     of_s: FloatArray
-    score: float
+    rows: FloatArray
+    of_jumps: float
 
     @classmethod
     def sum(cls, kind: ErrorKind, parts: Sequence[_Slope]) -> _Slope:
         """Derivatives with respect to errors of the same size, as one."""
-        names = ("sensitivity", "jumps", "of_z", "of_s")
+        names = ("sensitivity", "jumps", "of_z", "of_s", "rows")
         total: dict[str, FloatArray] = {n: np.sum([getattr(x, n) for x in parts], axis=0) for n in names}
-        return cls(kind=kind, **total, score=sum(x.score for x in parts))
+        return cls(kind=kind, **total, of_jumps=sum(x.of_jumps for x in parts))
+
+    @property
+    def score(self) -> float:
+        """Derivative of the cost."""
+        return float(self.rows.sum()) + self.of_jumps
 
 
 class Scores:
-    """Score tests at a fit: of errors one by one, or estimates of several together."""
+    """Score tests at a fit: of errors one by one, or estimates of several together, whose `slopes` it has."""
 
-    def __init__(self, intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> None:
+    def __init__(
+        self,
+        intervals: ShootingIntervals,
+        fit: Fit,
+        weights: FloatArray | None = None,
+        kinds: Sequence[ErrorKind] = (),
+    ) -> None:
         self.intervals, self.fit = intervals, fit
         if intervals.all_errors.delay.any():
             # Fractions of a sample are corrected by the rates of this fit, so that a step is compared with no step.
             self.intervals = intervals.corrected({}, self.rates)
             self.fit = replace(fit, residuals=fit.residuals + intervals.measured - self.intervals.measured)
         self.weights = weights_of(self.intervals, self.fit) if weights is None else weights
-        self.at = linearize(self.intervals, self.fit, self.weights)
+        changes = [self._changes(x) for x in kinds]
+        self.at = linearize(self.intervals, self.fit, self.weights, [own for own, _ in changes])
+        self.slopes = self._slopes(kinds, changes, self.at.along)
 
     @cached_property
     def rates(self) -> FloatArray:
@@ -159,64 +175,62 @@ class Scores:
         of_signals = (self.weights * x.sensitivity * y.sensitivity).sum()
         return float(of_signals + (self.at.precision * x.jumps * y.jumps).sum())
 
-    def slope(self, kind: ErrorKind) -> _Slope:
-        """Derivatives with respect to an error."""
-        return self._of_inputs(kind) if kind.of_inputs else self._of_signals(kind)
-
-    def _slopes(self, kinds: Sequence[ErrorKind]) -> list[_Slope]:
-        """Derivatives with respect to errors; those of a group of signals that others make up are sums of theirs."""
-        found = dict[ErrorKind, _Slope]()
-        for kind in sorted(kinds, key=lambda x: len(x.columns)):
-            left, parts = set(kind.columns), list[_Slope]()
-            for other, slope in reversed(found.items()):
-                if other.what == kind.what and not other.of_inputs and left.issuperset(other.columns):
-                    left.difference_update(other.columns)
-                    parts.append(slope)
-            found[kind] = self.slope(kind) if left or kind.of_inputs else _Slope.sum(kind, parts)
-        return [found[x] for x in kinds]
-
-    def _of_signals(self, kind: ErrorKind) -> _Slope:
-        columns = list(kind.columns)
-        own = np.zeros_like(self.intervals.measured)
-        own[:, columns] = -self.rates[:, columns] if kind.what == "delay" else 1.0
-        return self._slope(kind, own, np.zeros_like(self.at.jumps))
-
-    def _of_inputs(self, kind: ErrorKind) -> _Slope:
-        """By the difference of simulations, which end elsewhere, too."""
+    def _changes(self, kind: ErrorKind) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the residuals and of the jumps; of an error of inputs by the difference of simulations."""
+        if not kind.of_inputs:
+            columns, own = list(kind.columns), np.zeros_like(self.intervals.measured)
+            own[:, columns] = -self.rates[:, columns] if kind.what == "delay" else 1.0
+            return own, np.zeros((len(self.intervals) - 1, self.fit.x.shape[1]))
         step, fit = _STEPS[kind.what], self.fit
         moved = self.intervals.with_input_error(kind, step)
         late = with_residuals(moved, fit)
         own, jumps = late.residuals - fit.residuals, late.jumps(moved) - fit.jumps(self.intervals)
-        return self._slope(kind, np.where(self.intervals.known, own / step, 0.0), jumps / step)
+        return np.where(self.intervals.known, own / step, 0.0), jumps / step
 
-    def _slope(self, kind: ErrorKind, own: FloatArray, jumps: FloatArray) -> _Slope:
-        """Derivatives, from those of the residuals and of the jumps."""
-        at = self.at
-        # The gradient J' W e with errors that are larger by the sensitivity, of which no derivative is needed.
-        z, s = data_gradient(self.intervals, self.fit, self.weights, self.intervals.measured - own)
-        of_z, of_s = at.by_jumps(self.intervals, jumps)
-        of_z, of_s = of_z + at.data_z - z, of_s + (at.data_s - s).sum(axis=0)
-        score = (self.weights * own * self.fit.residuals).sum() + (at.precision * jumps * at.jumps).sum()
-        return _Slope(kind, own, jumps, of_z, of_s, float(score))
+    def _slopes(
+        self, kinds: Sequence[ErrorKind], changes: Sequence[tuple[FloatArray, FloatArray]], along: FloatArray
+    ) -> list[_Slope]:
+        """Derivatives with respect to errors, from those of the residuals and of the jumps."""
+        at, found = self.at, list[_Slope]()
+        for i, (kind, (own, jumps)) in enumerate(zip(kinds, changes, strict=True)):
+            of_z, of_s = at.by_jumps(self.intervals, jumps)
+            z, s = at.by_residuals(self.intervals, along[:, i])
+            of_jumps = float((at.precision * jumps * at.jumps).sum())
+            found.append(_Slope(kind, own, jumps, of_z + z, of_s + s, along[:, i, 0], of_jumps))
+        return found
+
+    def _of_groups(self, kinds: Sequence[ErrorKind]) -> list[_Slope]:
+        """Derivatives with respect to errors; those of a group of signals that others make up are sums of theirs."""
+        parts, fit = dict[ErrorKind, list[ErrorKind]](), self.fit
+        for kind in sorted(kinds, key=lambda x: len(x.columns)):
+            left, some = set(kind.columns), list[ErrorKind]()
+            for other in reversed(parts):
+                if other.what == kind.what and not other.of_inputs and left.issuperset(other.columns):
+                    left.difference_update(other.columns)
+                    some.append(other)
+            parts[kind] = [] if left or kind.of_inputs else some
+        alone = [x for x, some in parts.items() if not some]
+        changes, at = [self._changes(x) for x in alone], (fit.shared, fit.x, fit.d, self.weights)
+        sums = self.intervals.gauss_newton(*at, directions=[own for own, _ in changes], normal_matrix=False)
+        found = dict(zip(alone, self._slopes(alone, changes, sums.along), strict=True))
+        for kind, some in parts.items():
+            if some:
+                found[kind] = _Slope.sum(kind, [found[x] for x in some])
+        return [found[x] for x in kinds]
 
     def tested(self, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
         """Estimates of errors one by one, given all else that is estimated; without those not determined by the log."""
-        slopes = self._slopes(kinds)
-        n, weighted = len(self.intervals), [self.weights * x.sensitivity for x in slopes]
-
-        def by_interval(values: Sequence[FloatArray]) -> FloatArray:
-            pairs = zip(weighted, values, strict=True)
-            return np.stack([(x * y).sum(axis=1).reshape(n, -1).sum(axis=1) for x, y in pairs], axis=1)
-
+        slopes, n = self._of_groups(kinds), len(self.intervals)
+        shares = [(self.weights * np.square(x.sensitivity)).sum(axis=1).reshape(n, -1).sum(axis=1) for x in slopes]
         tests = scores_tested(
             self.at,
             Slopes(
-                share=by_interval([x.sensitivity for x in slopes]),
-                rows=by_interval([self.fit.residuals] * len(slopes)),
+                share=np.stack(shares, axis=1),
+                rows=np.stack([x.rows for x in slopes], axis=1),
                 of_z=np.stack([x.of_z for x in slopes], axis=-1),
                 of_s=np.stack([x.of_s for x in slopes], axis=-1),
                 by_jumps=np.array([(self.at.precision * np.square(x.jumps)).sum() for x in slopes]),
-                score_of_jumps=np.array([(self.at.precision * x.jumps * self.at.jumps).sum() for x in slopes]),
+                score_of_jumps=np.array([x.of_jumps for x in slopes]),
             ),
         )
         return [x for k, slope in enumerate(slopes) if (x := self._estimate(slope, tests, k)) is not None]
@@ -310,8 +324,8 @@ class JointEquations:
         weights : (N, n_s) array, optional
             Of the measurements; None: those of the fit, as `weights_of`.
         """
-        scores = Scores(intervals, fit, weights)
-        slopes = [scores.slope(x) for x in kinds]
+        scores = Scores(intervals, fit, weights, kinds)
+        slopes = scores.slopes
 
         def stacked(values: list[FloatArray], like: FloatArray) -> FloatArray:
             return np.stack(values, axis=-1) if values else np.zeros((*like.shape, 0))

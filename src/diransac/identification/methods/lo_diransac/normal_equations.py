@@ -28,6 +28,8 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
     from diransac.identification.methods.lo_diransac.mixture import Mixture
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -116,6 +118,8 @@ class NormalEquations:
     corners, rights : (W, n, n) and (W, n) array
         Information and right-hand side of the shared unknowns of each interval's log, from its measurements and its
         end.
+    along : (W, n_directions, 1 + n) array
+        Weighted products of changes of the residuals with these, and with their derivatives.
     """
 
     weights: FloatArray
@@ -129,6 +133,7 @@ class NormalEquations:
     precision: FloatArray
     corners: FloatArray
     rights: FloatArray
+    along: FloatArray
 
     def excess(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> FloatArray:
         """Jumps ``(W - 1, n_x)`` after a step, less those that these equations expect, from the step of a fit alone.
@@ -146,6 +151,22 @@ class NormalEquations:
         s = of_logs(intervals, moved.shared - fit.shared)
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
         return np.asarray(moved.jumps(intervals) - linear)
+
+    def by_residuals(self, intervals: ShootingIntervals, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Change of the gradient by larger residuals.
+
+        Parameters
+        ----------
+        intervals : ShootingIntervals
+        along : (W, 1 + n) array
+            Of a change of the residuals.
+
+        Returns
+        -------
+        (W, k) array, (n_s,) array
+        """
+        k = self.right_z.shape[1]
+        return along[:, 1 : 1 + k], sum_in_places(intervals, along[:, 1 + k :])
 
     def by_jumps(self, intervals: ShootingIntervals, more: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Change of the gradient by larger jumps.
@@ -208,7 +229,9 @@ def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingI
     return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
 
 
-def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> NormalEquations:
+def linearize(
+    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, directions: Sequence[FloatArray] = ()
+) -> NormalEquations:
     """Gauss-Newton normal equations of the cost at a fit.
 
     Parameters
@@ -217,13 +240,15 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
+    directions : sequence of (N, n_signals) array, optional
+        Changes of the residuals, along which the gradient is wanted, too.
 
     Returns
     -------
     NormalEquations
     """
     n_x, k = fit.x.shape[1], fit.x.shape[1] + fit.d.shape[1]
-    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
+    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights, directions=directions)
     H, g = sums.normal_matrix, -sums.gradient
     data_z, data_s = g[:, :k].copy(), _in_places(intervals, g[:, k:])
     F = sums.final_slopes[:-1]
@@ -263,7 +288,8 @@ def linearize(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> No
     blocks = (H[:, :k, :k], E, border, corner)
     has_prior = fit.boundary is not None or len(intervals.layout.with_prior)
     system = Arrowhead(*blocks, _FINE_RIDGE) if has_prior else Arrowhead(*blocks)
-    return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, jumps, F, precision, corners, rights)
+    of_jumps = jumps, F, precision
+    return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, *of_jumps, corners, rights, sums.along)
 
 
 def variances_of_intervals(
@@ -287,29 +313,6 @@ def variances_of_intervals(
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
     own = np.concatenate([z, of_logs(intervals, s)], axis=1)
     return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
-
-
-def data_gradient(
-    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, measured: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Right-hand sides of other measurements alone, as `data_z` and `data_s` of `NormalEquations`.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    weights : (N, n_signals) array
-        Weights of the measurements, one over each signal's unit squared.
-    measured : (N, n_signals) array
-
-    Returns
-    -------
-    (W, n_x + n_v) array, (W, n_s) array
-    """
-    sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights, measured=measured, normal_matrix=False)
-    gradient = -sums.gradient
-    k = fit.x.shape[1] + fit.d.shape[1]
-    return gradient[:, :k], _in_places(intervals, gradient[:, k:])
 
 
 def _places(intervals: ShootingIntervals) -> IntArray:

@@ -384,7 +384,7 @@ class ShootingIntervals:
         d: FloatArray,
         weights: FloatArray,
         *,
-        measured: FloatArray | None = None,
+        directions: Sequence[FloatArray] = (),
         chosen: IntArray | None = None,
         normal_matrix: bool = True,
     ) -> GaussNewtonBatch:
@@ -398,8 +398,8 @@ class ShootingIntervals:
         shared, x, d : array
         weights : (N, n_s) array
             Of the measurements, one over each signal's unit squared.
-        measured : (N, n_s) array, optional
-            Instead of the measured signals.
+        directions : sequence of (N, n_s) array, optional
+            Changes of the residuals, of which sums are wanted, too.
         chosen : (n,) int array, optional
         normal_matrix : bool, optional
             Whether it is needed.
@@ -411,14 +411,14 @@ class ShootingIntervals:
         derived, columns = self._derived
         batch, unknowns = self.batch(shared, x, d, chosen), self.augmented.unknowns
         threads = self.threads if len(self.measured) * len(unknowns) ** 2 > _WORTH_THREADS else 1
-        y = self.measured if measured is None else measured
-        measurements = Measurements(y[:, columns], self.measurements.valid)
+        measurements = Measurements(self.measured[:, columns], self.measurements.valid)
         return derived.gauss_newton(
             batch,
             measurements,
             weights[:, columns],
             unknowns=unknowns,
             normal_matrix=normal_matrix,
+            directions=np.stack([x[:, columns] for x in directions], axis=1) if directions else None,
             threads=threads,
         )
 
