@@ -41,6 +41,8 @@ _N_STARTS = 256
 # Rows of all logs that are enough to find starts, and of each of many; numbers of all rows and pairs of unknowns of all
 # starts at most.
 _ENOUGH, _ENOUGH_OF_ONE, _NUMBERS = 2000, 500, 200_000_000
+# Relative decrease of the cost in a step from which on a start goes on.
+_CREEPING = 1e-5
 _TURN = 2.0 * np.pi
 
 
@@ -218,7 +220,7 @@ class ObserverFit:
         some = self if n_rows <= _ENOUGH else self._on_stretches(_ENOUGH / n_rows)
         z = some.starts()
         for n_steps, n_kept in steps:
-            z, cost = least_squares(some, z, n_steps)
+            z, cost = least_squares(some, z, n_steps, _CREEPING)
             z = z[np.argsort(cost, kind="stable")[:n_kept]]
         return z if some.rows_of_logs == self.rows_of_logs else self._begun(z)
 
