@@ -202,8 +202,12 @@ class BoundNonlinear:
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
         """See `BoundEstimator.fit_without`."""
-        start = self.chart.to_free(self._fit_equal(rows[None]))[:, None]
-        return np.array([self._likeliest(rows_without(rows, group)[None], start)[0] for group in groups])
+        whole = self._fit_equal(rows[None])[0]
+        return np.array([self.fit_from(rows_without(rows, group), whole) for group in groups])
+
+    def fit_from(self, rows: IntArray, p: FloatArray) -> FloatArray:
+        """Parameters ``(n,)`` of the optimum of some rows that is nearest to others ``(n,)``."""
+        return np.asarray(self._likeliest(rows[None], self.chart.to_free(p[None])[:, None])[0])
 
     def steps_without(self, groups: Sequence[IntArray], rows: IntArray, p: FloatArray) -> FloatArray:
         """Parameters ``(n_groups, n)`` without each group of positions in the rows, by one step from the fit of all.

@@ -234,6 +234,11 @@ class Arbiter:
         return np.asarray(sampled if self.lost is None else sampled & ~self.lost)
 
     @cached_property
+    def _counts(self) -> list[IntArray]:
+        """Numbers ``(K, n_s)`` of the predicted samples that count, by horizon."""
+        return [self._known[:, :n].sum(axis=1) for n in self._n_rows]
+
+    @cached_property
     def outliers_of_fit(self) -> BoolArray:
         """Mask ``(K, n_after, n_s)`` of the predicted samples that a fit takes for outliers."""
         return ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
@@ -292,8 +297,7 @@ class Arbiter:
         spread, no_change = self._sizes
         losses, found = list[FloatArray](), list[FloatArray]()
         squares = np.where(self._known, np.square(errors), 0.0)
-        for n, size in zip(self._n_rows, no_change, strict=True):
-            count = self._known[:, :n].sum(axis=1)
+        for n, count, size in zip(self._n_rows, self._counts, no_change, strict=True):
             mse = np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan)
             losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
             found.append(_medians(mse / np.square(size)))

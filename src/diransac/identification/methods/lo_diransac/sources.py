@@ -215,6 +215,6 @@ def _nonlinear(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray
 
     bound = NonlinearLeastSquares().bind(own)
     rows = np.arange(0, bound.n_rows, max(1, bound.n_rows // _MOST_ROWS))
-    found = bound.select([rows]).fit()[0]
+    found = bound.fit_from(rows, bound.of_all_rows)
     groups = [np.flatnonzero(block[rows] == k) for k in range(n_blocks)]
     return found, bound.steps_without(groups, rows, found)
