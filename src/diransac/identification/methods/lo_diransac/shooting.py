@@ -252,11 +252,12 @@ class ShootingIntervals:
         ShootingIntervals
         """
         errors = self.all_errors.plus(more)
-        whole = np.round(errors.delay)
-        rows = self._rows_later(whole)
-        measured = np.take_along_axis(errors.measured, rows, axis=0)
-        sampled = np.take_along_axis(errors.sampled, rows, axis=0) & (rows >= 0)
-        measured += (errors.delay - whole) * rates - errors.bias
+        whole, measured, sampled = np.round(errors.delay), errors.measured, errors.sampled
+        if whole.any():
+            rows = self._rows_later(whole)
+            measured = np.take_along_axis(measured, rows, axis=0)
+            sampled = np.take_along_axis(sampled, rows, axis=0) & (rows >= 0)
+        measured = measured + (errors.delay - whole) * rates - errors.bias
         return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, errors=errors)
 
     def weights_in(self, other: ShootingIntervals, weights: FloatArray) -> FloatArray:
