@@ -36,8 +36,8 @@ from diransac.model import Model, Parameter
 from diransac.model.derivation import Symbols
 from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
-_N_STARTS = 256
-"""Starts at most."""
+_N_STARTS, _OF_ONE = 256, 4
+"""Starts at most, and for one parameter: so many to the power of their number."""
 # Rows of all logs that are enough to find starts, and of each of many; numbers of all rows and pairs of unknowns of all
 # starts at most.
 _ENOUGH, _ENOUGH_OF_ONE, _NUMBERS = 2000, 500, 200_000_000
@@ -201,8 +201,9 @@ class ObserverFit:
             return self.begin.reshape(1, -1)
         # Fewer starts of larger problems.
         n_rows, n_unknowns = sum(x.stop - x.start for x in self.rows_of_logs), len(self.layout) + self.begin.size
-        chart, n = ParameterChart(self.layout.bounds), _NUMBERS // (n_rows * n_unknowns**2)
-        return self._begun(chart.to_parameters(chart.starts(int(np.clip(n, 16, _N_STARTS)))))
+        n = min(_N_STARTS, _OF_ONE ** len(self.layout), _NUMBERS // (n_rows * n_unknowns**2))
+        chart = ParameterChart(self.layout.bounds)
+        return self._begun(chart.to_parameters(chart.starts(max(16, n))))
 
     def _begun(self, z: FloatArray) -> FloatArray:
         """Unknowns with the parameters of others, and the states to start from."""

@@ -19,6 +19,7 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -63,8 +64,10 @@ _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 _MAX_SWEEPS = 12
 # Change of an error of a recording over its standard error that ends a fit.
 _ERRORS_SETTLED = 0.1
-# Steps after which a fit that is a nat in every sample behind its rival is lost; it may be further behind before.
-_PATIENCE = 20
+# Nats in every sample by which a fit is lost; steps of which the best says how much it gains in each of so many more.
+_LOST, _RECENT, _MORE = 2.5, 4, 10
+# Updates of the noise at most, and nats in every sample from which on they go on.
+_UPDATES, _SETTLED = 20, 0.01
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,7 @@ def refine_exact(
         Initial fit, as from `refine`.
     prior : Prior
     rival : float, optional
-        Cost of a fit to which this one is an alternative: it ends where it is far behind, the sooner the further.
+        Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
 
     Returns
     -------
@@ -312,13 +315,14 @@ def refine_exact(
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    at, behind = linearized(intervals, fit), -np.inf
-    while steps < settings.max_steps and not converged and not _is_lost(intervals, behind, steps):
+    at, behind = linearized(intervals, fit), list[float]()
+    while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
         intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
-        behind = float(moved.noise.negative_log_likelihood(moved.residuals, intervals.known).sum()) - rival
+        if rival < np.inf:
+            behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
@@ -333,9 +337,23 @@ def refine_exact(
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
 
-def _is_lost(intervals: ShootingIntervals, behind: float, steps: int) -> bool:
-    """True if a fit whose loss is so far behind its rival's cost after some steps stays behind it."""
-    return bool(behind > max(1.0, _PATIENCE / max(steps, 1)) * intervals.known.sum())
+def _is_lost(intervals: ShootingIntervals, behind: Sequence[float]) -> bool:
+    """True if a fit that was so far behind its rival after each step stays behind."""
+    if len(behind) <= _RECENT:
+        return False
+    best = max(-np.diff(behind[-_RECENT:]).min(), 0.0)
+    return bool(behind[-1] - _MORE * best > _LOST * intervals.known.sum())
+
+
+def _least_loss(intervals: ShootingIntervals, fit: Fit, *, outliers: bool) -> float:
+    """Negative log-likelihood of the samples with the likeliest noise: that of a fit lags behind its residuals."""
+    noise, residuals, known, loss = fit.noise, fit.residuals, intervals.known, np.inf
+    for _ in range(_UPDATES):
+        before, loss = loss, float(noise.negative_log_likelihood(residuals, known).sum())
+        if before - loss < _SETTLED * known.sum():
+            break
+        noise = noise.updated(residuals, known, noise.inlying(residuals, known), outliers=outliers)
+    return loss
 
 
 def _evidence(at: JointEquations) -> float:
