@@ -69,7 +69,7 @@ def least_squares(
         trial = problem.moved(z[active], step)
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]
-        settled = (np.abs(then[0] - cost[active]) <= tolerance * cost[active]) | (damping[active] >= _BOUNDS[1])
+        settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])
         to = active[better]
         z[to], cost[to], gradient[to], matrix[to] = (x[better] for x in (trial, *then))
         damping[active] = np.clip(np.where(better, 0.2, 6.0) * damping[active], *_BOUNDS)
