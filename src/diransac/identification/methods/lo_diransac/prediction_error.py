@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.linear_intervals import TINY
 from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
@@ -127,8 +128,8 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     """Parameters with the likeliest predictions by slopes over the spread, if the samples are likelier with these.
 
     Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
-    standard errors do not see.  The mean of the latest passes counts; what it differs from the local end is an error of
-    either.
+    standard errors do not see.  The mean of the latest passes counts; it is no surer than the local end, and what it
+    differs from that is an error of either.
 
     Parameters
     ----------
@@ -147,14 +148,15 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     none = np.zeros(int(found.predictor.free_delay))
     precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
     widths = _widths(found)
-    predictor = replace(found.predictor, spread=_with_widths(found.covariance, widths))
+    predictor = replace(found.predictor, spread=with_widths(found.covariance, widths))
     passes, latest = list[Minimum](), _Latest((), (), ())
     for k in range(_SPREAD_PASSES):
         now = predictor.over_logs(p)
         if not passes and (_is_alike(now, found.last) or is_worse(now.losses, found.last.losses)):
             return found
         pull = precision * np.concatenate([layout.prior_mean - p, none])
-        step, covariance = now.step(precision, pull, _bounds_of_step(predictor, p)), now.robust_covariance(precision)
+        step = now.step(precision, pull, _bounds_of_step(predictor, p))
+        covariance = _no_surer(now.robust_covariance(precision), found.covariance)
         latest = latest.and_(step, covariance, now.losses)
         passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
         if progress is not None:
@@ -163,7 +165,7 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
         if converged or (len(passes) == _LATEST and not is_likelier):
             break
         p, predictor = _moved(_with_scales(predictor, now, outliers=outliers), p, step)
-        predictor = replace(predictor, spread=_with_widths(covariance, widths))
+        predictor = replace(predictor, spread=with_widths(covariance, widths))
     if not is_likelier:
         return found
     likeliest = min(passes, key=lambda x: float(x.last.losses.sum()))
@@ -171,6 +173,12 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     other = mean - _with_delay(found)
     p, predictor = _moved(likeliest.predictor, likeliest.parameters, mean - _with_delay(likeliest))
     return Minimum(predictor, p, likeliest.last, converged, latest.covariance() + 0.25 * np.outer(other, other))
+
+
+def _no_surer(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """Covariance with standard deviations that are at least those of another one."""
+    more = np.sqrt(np.maximum(1.0, np.diag(least) / np.maximum(np.diag(covariance), TINY**2)))
+    return np.asarray(covariance * np.outer(more, more))
 
 
 def _is_alike(now: Pass, before: Pass) -> bool:
@@ -190,8 +198,15 @@ def _widths(found: Minimum) -> FloatArray:
     return np.where(errors > 0.0, np.minimum(_SPREAD * errors, widest), widest)
 
 
-def _with_widths(covariance: FloatArray, widths: FloatArray) -> FloatArray:
-    """Covariance with these standard deviations, and nearly the correlations of another: no direction has none."""
+def with_widths(covariance: FloatArray, widths: FloatArray) -> FloatArray:
+    """Covariance ``(n, n)`` with nearly the correlations of another one, so that every direction has a width.
+
+    Parameters
+    ----------
+    covariance : (n, n) array
+    widths : (n,) array
+        Its standard deviations.
+    """
     errors = np.sqrt(np.diag(covariance))
     scale = np.divide(widths, errors, out=np.zeros_like(errors), where=errors > 0.0)
     correlated = _ALIKE * covariance * np.outer(scale, scale)
