@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from diransac.identification.methods.lo_diransac.following import bounded_influence
-from diransac.identification.methods.lo_diransac.prediction_error import is_worse
+from diransac.identification.methods.lo_diransac.linear_intervals import Belief, LinearInterval, Update
+from diransac.identification.methods.lo_diransac.prediction_error import is_worse, with_widths
 
 
 def intervals_of(n: int = 200) -> np.ndarray:
@@ -46,3 +47,93 @@ def test_losses_differ_where_most_intervals_agree_that_they_do():
     assert not is_worse(jumps + 1.0, np.zeros(200))
     assert is_worse(np.full(200, 1.0), np.zeros(200))
     assert not is_worse(np.full(200, 1e-3), np.zeros(200))  # a fifth of a nat
+
+
+N_X, N_Q, N_P, ROWS = 3, 2, 2, 4
+
+
+def belief_of(seed: int = 0) -> tuple[Belief, np.ndarray]:
+    """Belief of a state, and a root of the covariance of two parameters."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(N_X, N_X))
+    return Belief(root @ root.T, rng.normal(size=(N_X, N_P))), np.array([[0.2, 0.0], [-0.1, 0.05]])
+
+
+def test_slopes_over_the_spread_of_a_linear_interval_are_local_ones():
+    belief, root = belief_of()
+    rng = np.random.default_rng(1)
+    errors, J = rng.normal(size=(ROWS, 1)), rng.normal(size=(ROWS, 1, N_X + N_P))
+    end, F = rng.normal(size=N_X), rng.normal(size=(N_X, N_X + N_P))
+    points = belief.points(root)
+    over = LinearInterval.over_spread(
+        belief, N_Q, root, errors + np.einsum("rsj,kj->krs", J, points), end + points @ F.T
+    )
+    local = LinearInterval.local(belief, N_Q, (errors, J), (end, F))
+    assert local.is_local
+    assert not over.is_local
+    for name in (
+        "errors",
+        "of_state",
+        "of_parameters",
+        "end",
+        "end_of_state",
+        "end_of_parameters",
+        "end_of_velocities",
+    ):
+        np.testing.assert_allclose(getattr(over, name), getattr(local, name), atol=1e-9)
+    np.testing.assert_allclose(over.left, 0.0, atol=1e-9)
+    np.testing.assert_allclose(over.variance, local.variance)
+
+
+def test_the_mean_and_variance_over_a_spread_are_those_of_a_gaussian_state():
+    """For the square of a state's coordinate, both are known: ``m^2 + s^2`` and ``4 m^2 s^2 + 2 s^4``."""
+    belief, root = Belief(np.diag([0.09, 1.0, 1.0]), np.zeros((N_X, N_P))), 0.1 * np.eye(N_P)
+    x = 2.0 + belief.points(root)[:, 0]
+    over = LinearInterval.over_spread(
+        belief, N_Q, root, np.square(x)[:, None, None], np.outer(np.square(x), np.ones(N_X))
+    )
+    np.testing.assert_allclose(over.errors, [[4.0 + 0.09]])
+    np.testing.assert_allclose(over.variance, [[4.0 * 4.0 * 0.09 + 2.0 * 0.09**2]])
+
+
+def test_a_curved_effect_of_parameters_moves_no_prediction():
+    belief, root = belief_of()[0], 0.5 * np.eye(N_P)
+    p = 1.0 + belief.points(root)[:, N_X]
+    over = LinearInterval.over_spread(belief, N_Q, root, np.square(p)[:, None, None], np.zeros((len(p), N_X)))
+    np.testing.assert_allclose(over.errors, [[1.0]])
+    np.testing.assert_allclose(over.of_parameters, [[[2.0, 0.0]]], atol=1e-12)
+    np.testing.assert_allclose(over.left, 0.0, atol=1e-12)
+
+
+def test_an_update_is_that_of_bayes_with_what_slopes_leave_as_noise():
+    belief, root = belief_of(2)
+    rng = np.random.default_rng(3)
+    points = belief.points(root)
+    bent = rng.normal(size=(ROWS, 1, N_X)) * 0.3
+    errors = rng.normal(size=(ROWS, 1)) + np.einsum("rsj,kj->krs", bent, np.square(points[:, :N_X]))
+    linear = LinearInterval.over_spread(belief, N_Q, root, errors, points[:, :N_X])
+    weights = rng.uniform(0.5, 2.0, (ROWS, 1))
+    update = Update.of(belief, linear, weights)
+
+    of_state, left, of_p = (x.reshape(ROWS, -1) for x in (linear.of_state, linear.left, linear.of_parameters))
+    S = np.linalg.inv(of_state @ of_state.T + left @ left.T + np.diag(1.0 / weights.ravel()))
+    gain = belief.root @ of_state.T @ S
+    np.testing.assert_allclose(update.moved, -gain @ linear.errors.ravel())
+    np.testing.assert_allclose(update.belief.covariance, belief.covariance - gain @ of_state @ belief.root.T, atol=1e-9)
+    np.testing.assert_allclose(update.information, of_p.T @ S @ of_p)
+    np.testing.assert_allclose(update.score, -of_p.T @ S @ linear.errors.ravel())
+    unknown, end = np.hstack([of_state, left]), np.hstack([linear.end_of_state, linear.end_left])
+    np.testing.assert_allclose(update.end, linear.end - end @ unknown.T @ S @ linear.errors.ravel())
+    covariance = end @ (np.eye(2 * N_X) - unknown.T @ S @ unknown) @ end.T
+    np.testing.assert_allclose(update.belief_of_end.covariance, covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 1.0])
+def test_a_spread_has_a_width_in_every_direction(correlation: float):
+    """That of parameters which the logs tell together alone, or not at all, as well."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = 4.0 * np.array([[1.0, -correlation], [-correlation, 1.0]])
+    spread = with_widths(covariance, np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(np.sqrt(np.diag(spread)), [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(spread[0, 1], -0.99 * correlation * 0.02)
+    assert np.linalg.eigvalsh(spread).min() > 1e-6

@@ -16,7 +16,7 @@ import diransac as dr
 from command_line import run
 from diransac.errors import ModelError, ResultError, TimeLimitError
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.methods.lo_diransac import without_equations
+from diransac.identification.methods.lo_diransac import prediction_error, without_equations
 from diransac.identification.methods.lo_diransac.following import Predictor
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised
 from diransac.model.mjcf import MujocoModel, calibrated_text
@@ -41,6 +41,7 @@ LEG = """<body name="leg{k}" pos="{x} {y} 0"><inertial pos="0 0 -.15" mass=".3" 
 CORNERS = ((0.15, 0.1), (0.15, -0.1), (-0.15, 0.1), (-0.15, -0.1))
 SERVO = '<position name="slide{k}" joint="slide{k}" kp="2000" kv="60"/>'
 
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FOUR_BAR = """<mujoco><option timestep="0.002"/><worldbody>
   <body name="crank"><joint name="crank" axis="0 1 0" armature="{a}" damping=".02"/>
     <inertial pos=".04 0 0" mass=".2" diaginertia="1e-4 2e-4 2e-4"/>
@@ -265,6 +266,42 @@ def test_a_base_that_nothing_measures_is_followed(hopper_file: Path) -> None:
     assert result.parameters["body/payload.ipos[0]"] == pytest.approx(0.04, abs=0.005)
 
 
+TRAY = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+  <body name="box" pos="0 0 .05"><freejoint name="box"/><inertial pos="0 0 0" mass="{m}" diaginertia="2e-3 2e-3 3e-3"/>
+    <geom name="box" type="box" size=".08 .1 .05" friction="{f}" priority="1"/></body>
+  <body name="tray" pos="0 0 .05"><joint name="tray" type="slide" axis="1 0 0" damping="{d}" stiffness="300"/>
+    <inertial pos="0 0 0" mass=".8" diaginertia="1e-3 1e-3 1e-3"/>
+    <geom type="box" size=".01 .06 .02" pos="-.11 0 0"/><geom type="box" size=".01 .06 .02" pos=".11 0 0"/>
+  </body></worldbody><actuator><motor name="push" joint="tray"/></actuator></mujoco>"""
+
+
+def test_contacts_that_chatter_are_told_by_slopes_over_the_spread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A box rattles in a tray: its samples are likelier, and its parameters are within their intervals."""
+    truth = {"geom/box.friction[0]": 0.45, "body/box.mass": 1.0, "joint/tray.damping": 4.0}
+    names: dict[str, Any] = {f"box_{x}": (lambda d, k=k: d.qpos[k], 1e-3) for k, x in enumerate(POSE)}
+    names |= {"tray": (lambda d: d.qpos[7], 1e-4), "tray_dot": (lambda d: d.qvel[6], 5e-3)}
+    text = TRAY.format(f=0.45, m=1.0, d=4.0)
+    log = recorded(text, lambda t: 14.0 * np.sin(7.0 * t) + 10.0 * np.sin(4.3 * t + 1.0), 4.0, names, 7)
+    (tmp_path / "tray.xml").write_text(TRAY.format(f=0.7, m=0.7, d=2.0))
+    ends: list[tuple[Minimum, Minimum]] = []
+
+    def over_spread(found: Minimum, **options: Any) -> Minimum:
+        ends.append((found, prediction_error.over_spread(found, **options)))
+        return ends[-1][1]
+
+    monkeypatch.setattr(without_equations, "over_spread", over_spread)
+    result = dr.identify(dr.models.mujoco(tmp_path / "tray.xml", unknown=list(truth)), log)
+    ((local, spread),) = ends
+    assert spread.last.losses.sum() < local.last.losses.sum() - 100.0
+    assert (np.diag(spread.covariance) >= np.diag(local.covariance)).all()
+    for name, (low, high) in result.intervals(0.95).items():
+        assert low <= truth[name] <= high
+        assert high - low < 0.4 * truth[name]
+    assert result.verdict != "do not rely on this"
+
+
 CART = """<body name="cart{k}"><joint name="x{k}" type="slide" axis="1 0 0" damping="{d}"/>
     <inertial pos="0 0 0" mass="{m}" diaginertia="1 1 1"/></body>"""
 
@@ -345,6 +382,20 @@ def test_a_time_limit_during_a_further_start_is_said_and_the_best_so_far_is_kept
         raise TimeLimitError
 
     monkeypatch.setattr(without_equations, "minimised", fitted)
+    log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
+    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)
+    assert result.stop_reason == TIME_LIMIT
+    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_time_limit_during_passes_over_the_spread_keeps_the_local_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def over_spread(found: Minimum, **_: Any) -> Minimum:
+        raise TimeLimitError
+
+    monkeypatch.setattr(without_equations, "over_spread", over_spread)
     log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
     (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
     result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)

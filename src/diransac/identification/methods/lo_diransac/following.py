@@ -21,8 +21,15 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.input_timing import acting_inputs
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
+from diransac.identification.methods.lo_diransac.linear_intervals import (
+    RADIUS,
+    TINY,
+    Belief,
+    LinearInterval,
+    Update,
+)
 from diransac.identification.methods.lo_diransac.mixture import Mixture
-from diransac.simulation import LinearizedErrors, Measurements, RolloutBatch, default_threads, rollouts
+from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -37,11 +44,13 @@ _LACKS = 0.3
 """Change of a velocity in an interval that the model lacks at first, of the change that it predicts."""
 _SMALL = 1e-3
 """Least change of a velocity of which the model lacks a part, over its size."""
-_FIRST_NOISE, _LEAST_NOISE, _TINY = 3.0, 1e-3, 1e-12
+_FIRST_NOISE, _LEAST_NOISE = 3.0, 1e-3
 """Noise of a signal before anything is fitted, over that of its bends; at least, over its spread."""
-_LOST, _ROUNDING = 1e4, 1e-12
+_LOST = 1e4
 _FOLLOWED = 0.5
-"""Part of the samples that must agree: if fewer do in two intervals, the motion begins anew with the samples."""
+"""Part of a signal's samples that must agree: if fewer do in two intervals, the motion begins anew with the samples."""
+_LEFT = 4.0
+"""Mean variance that slopes over the spread leave, over that of the noise, at most."""
 _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
 """Weights of an interval's samples that are tried."""
 _TOLD = 0.3
@@ -114,7 +123,7 @@ class Pass:
             beyond = free & (held != step)
             if not beyond.any():
                 break
-            worst = np.argmax(np.where(beyond, np.abs(step - held) / (bounds[1] - bounds[0] + _TINY), -1.0))
+            worst = np.argmax(np.where(beyond, np.abs(step - held) / (bounds[1] - bounds[0] + TINY), -1.0))
             step[worst], free[worst] = held[worst], False
         return step
 
@@ -131,14 +140,14 @@ class Pass:
         """
         white = self.covariance(precision)
         scatter = np.square(batch_sums(self.scores @ white)).sum(axis=0)
-        more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + _TINY**2)))
+        more = np.sqrt(np.maximum(1.0, scatter / (np.diag(white) + TINY**2)))
         return np.asarray(white * np.outer(more, more))
 
 
 def _inverse(information: FloatArray) -> FloatArray:
     """Inverse in columns of unit size; 0 of what there is no information about."""
     d = np.sqrt(np.maximum(np.diag(information), 0.0))
-    scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > _TINY)
+    scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > TINY)
     return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
 
 
@@ -161,7 +170,7 @@ def bounded_influence(information: FloatArray) -> FloatArray:
     for _ in range(_ROUNDS):
         covariance = _inverse(np.einsum("w,wij->ij", weights, information))
         told = np.einsum("ij,wji->w", covariance, information)
-        weights = np.minimum(1.0, most / np.maximum(told, _TINY))
+        weights = np.minimum(1.0, most / np.maximum(told, TINY))
     return weights
 
 
@@ -179,6 +188,9 @@ class Predictor:
         Of the inputs, samples.
     free_delay : bool
         Whether it is estimated.
+    spread : (n, n) array, optional
+        Covariance of the parameters, and of the delay, over which slopes are taken, those of states over their own;
+        None: local ones.
     """
 
     intervals: ShootingIntervals
@@ -186,6 +198,7 @@ class Predictor:
     lacks: float = _LACKS
     delay: float = 0.0
     free_delay: bool = True
+    spread: FloatArray | None = None
 
     @classmethod
     def of(cls, intervals: ShootingIntervals, *, outliers: bool, free_delay: bool) -> Predictor:
@@ -196,12 +209,12 @@ class Predictor:
         seen: BoolArray = np.asarray(intervals.known.any(axis=0))
         for j in np.flatnonzero(seen):
             y = intervals.measured[intervals.known[:, j], j]
-            low[j], high[j] = y.min(), max(y.max(), y.min() + _TINY)
+            low[j], high[j] = y.min(), max(y.max(), y.min() + TINY)
             spread[j] = float(robust_std(y - np.median(y))) or np.ptp(y) or 1.0
             bends = float(robust_std(np.diff(y, 2))) if len(y) > _FIRST else 0.0
-            noise[j] = max(_FIRST_NOISE * bends / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], _TINY)
+            noise[j] = max(_FIRST_NOISE * bends / np.sqrt(6.0), 10.0 * _LEAST_NOISE * spread[j], TINY)
         pi = np.full(n, 0.1 if outliers else 0.0)
-        floor = np.maximum(1e-2 * _LEAST_NOISE * spread, _TINY)
+        floor = np.maximum(1e-2 * _LEAST_NOISE * spread, TINY)
         whole = [four for four in intervals.model.quaternions if seen[list(four)].all()]
         for four in whole:
             noise[list(four)], floor[list(four)] = noise[list(four)].max(), floor[list(four)].max()
@@ -257,14 +270,13 @@ class Predictor:
 
     def over_logs(self, p: FloatArray) -> Pass:
         """Predictions with parameters ``(n_p,)``."""
-        one, inputs, home = self.intervals, self.acting(self.delay), self.intervals.model.home
-        later = self.acting(self.delay + _DELAY_STEP) if self.free_delay else None
-        run = _Run(self, p, inputs, later)
-        state, belief = self.first_state(0, home), _Belief.begin(self.unsure, run.n)
+        one, home = self.intervals, self.intervals.model.home
+        run = _Run(self, p) if self.spread is None else _SpreadRun(self, p)
+        state, belief = self.first_state(0, home), Belief.begin(self.unsure, run.n)
         for w in range(len(one)):
             if w and (run.is_lost or not one.following[w]):
                 rest = home if one.log_of[w] != one.log_of[w - 1] else state
-                state, belief = self.first_state(w, rest), _Belief.begin(self.unsure, run.n)
+                state, belief = self.first_state(w, rest), Belief.begin(self.unsure, run.n)
             state, belief = run.interval(w, state, belief)
         return run.result()
 
@@ -277,30 +289,19 @@ class Predictor:
         return self._simulator.trajectories(batch, threads=one.threads).reshape(len(one.measured), -1)
 
 
-@dataclass(frozen=True)
-class _Belief:
-    """Covariance of a state, and the change of its mean with the parameters."""
-
-    covariance: FloatArray
-    slopes: FloatArray
-
-    @classmethod
-    def begin(cls, unsure: FloatArray, n: int) -> _Belief:
-        return cls(np.diag(np.square(unsure)), np.zeros((len(unsure), n)))
-
-
 class _Run:
-    """One pass."""
+    """One pass, with local slopes."""
 
-    def __init__(self, predictor: Predictor, p: FloatArray, inputs: FloatArray, later: FloatArray | None) -> None:
-        self.predictor, self.p, self.inputs, self.later = predictor, p, inputs, later
+    def __init__(self, predictor: Predictor, p: FloatArray) -> None:
+        self.predictor, self.p, self.inputs = predictor, p, predictor.acting(predictor.delay)
         one = predictor.intervals
-        self.n = len(p) + (later is not None)
+        self.n = len(p) + predictor.free_delay
         self.states = np.empty((len(one), one.model.n_q + one.model.n_v))
         self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
         self.information, self.losses, self.lost = np.zeros((len(one), self.n, self.n)), *np.zeros((2, len(one)))
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
-        self.surprise, self.age, self.is_lost, self.contradicts = list[FloatArray](), 0, False, False
+        self.surprise, self.age, self.is_lost = list[FloatArray](), 0, False
+        self.contradicts = np.zeros(len(predictor.columns), bool)
         self.threads = one.threads if one.threads > 1 else default_threads()
 
     def result(self) -> Pass:
@@ -315,85 +316,80 @@ class _Run:
     def batch(self, w: int, state: FloatArray, inputs: FloatArray) -> RolloutBatch:
         """One lane over an interval."""
         one = self.predictor.intervals
-        parameters = one.parameters_of(self.p, one.log_of[w : w + 1])
-        lane = parameters if parameters.ndim == 2 else parameters[None]
-        return RolloutBatch(lane, state[None], inputs, one.dt, one.starts[w : w + 1], one.length, one.first_of_log)
+        parameters = np.atleast_2d(one.parameters_of(self.p, one.log_of[w : w + 1]))
+        return RolloutBatch(
+            parameters, state[None], inputs, one.dt, one.starts[w : w + 1], one.length, one.first_of_log
+        )
 
-    def linearized(self, w: int, state: FloatArray) -> LinearizedErrors:
-        """Errors of an interval and their derivatives with respect to state, parameters and delay."""
+    @cached_property
+    def later(self) -> FloatArray:
+        """Inputs with a delay that is a little longer."""
+        return self.predictor.acting(self.predictor.delay + _DELAY_STEP)
+
+    def linear(self, w: int, state: FloatArray, belief: Belief) -> LinearInterval | None:
+        """An interval's samples and end by slopes with respect to state, parameters and delay; None: it diverges."""
         predictor, model = self.predictor, self.predictor.intervals.model
         simulator, measurements = predictor._simulator, predictor._measurements
-        names = (*model.state, *model.parameters)
-        found = simulator.linearized_errors(
-            self.batch(w, state, self.inputs),
-            measurements,
-            unknowns=names,
-            threads=self.threads,
-        )
-        if self.later is None:
-            return found
-        late, end = simulator.errors_and_ends(self.batch(w, state, self.later), measurements, threads=1)
+        names, now = (*model.state, *model.parameters), self.batch(w, state, self.inputs)
+        found = simulator.linearized_errors(now, measurements, unknowns=names, threads=self.threads)
         assert found.final_states is not None
         assert found.final_slopes is not None
-        of_delay = (late - found.errors) / _DELAY_STEP
-        of_end = (end - found.final_states) / _DELAY_STEP
-        return replace(
-            found,
-            jacobian=np.concatenate([found.jacobian, of_delay[..., None]], axis=3),
-            final_slopes=np.concatenate([found.final_slopes, of_end[..., None]], axis=2),
-        )
+        e, J, end, F = found.errors[0], found.jacobian[0], found.final_states[0], found.final_slopes[0]
+        if predictor.free_delay:
+            late, late_end = simulator.errors_and_ends(self.batch(w, state, self.later), measurements, threads=1)
+            J = np.concatenate([J, ((late[0] - e) / _DELAY_STEP)[..., None]], axis=2)
+            F = np.column_stack([F, (late_end[0] - end) / _DELAY_STEP])
+        if not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(end).max() < _LOST):
+            return None
+        return LinearInterval.local(belief, model.n_q, (e, J), (end, F))
 
-    def interval(self, w: int, state: FloatArray, belief: _Belief) -> tuple[FloatArray, _Belief]:
+    def interval(self, w: int, state: FloatArray, belief: Belief) -> tuple[FloatArray, Belief]:
         """State and belief at the end of an interval, after its samples."""
         check_time()
-        one, columns, n_x = self.predictor.intervals, self.predictor.columns, len(state)
+        one, columns = self.predictor.intervals, self.predictor.columns
         rows = slice(int(one.starts[w]), int(one.starts[w]) + one.length)
         known = one.known[rows][:, columns]
-        at = self.linearized(w, state)
-        assert at.final_states is not None
-        assert at.final_slopes is not None
-        e, J, F = at.errors[0], at.jacobian[0], at.final_slopes[0]
-        self.is_lost = not (np.isfinite(J).all() and np.isfinite(F).all() and np.abs(at.final_states).max() < _LOST)
-        if self.is_lost:
+        linear = self.linear(w, state, belief)
+        self.is_lost = linear is None
+        if linear is None:
             self.states[w], self.lost[w] = state, 10.0 * float(known.sum())
             return state, belief
-        noise = self._noise
-        expected = np.einsum("rsi,ij,rsj->rs", J[..., :n_x], belief.covariance, J[..., :n_x])
+        noise, e, expected = self._noise, linear.errors, linear.variance
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
         inlying = noise.inlying(e / wide, known)
-        weights, before = inlying / np.square(noise.sigma), self.contradicts and bool(one.following[w])
-        self.contradicts = bool(inlying.sum() < _FOLLOWED * known.sum())
-        self.is_lost = self.contradicts and before
+        weights, before = inlying / np.square(noise.sigma), self.contradicts & bool(one.following[w])
+        self.contradicts = inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0)
+        self.is_lost = bool((self.contradicts & before).any())
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
-        update, ends = self._tempered(w, state, belief, (e, J, weights, at.final_states[0]))
+        update = self.updated(w, state, belief, linear, weights)
         self._count(w, update, belief)
         self.states[w] = state + update.moved
         self.errors[rows, columns] = np.where(known, e, 0.0)
         self.expected[rows, columns] = expected
-        self.residuals[rows, columns] = np.where(known, e + J[..., :n_x] @ update.moved, 0.0)
-        return self._propagated(w, state, update, (at.final_states[0], F, ends))
+        self.residuals[rows, columns] = np.where(known, update.residuals, 0.0)
+        self.is_lost |= bool(np.abs(update.end).max() > _LOST)
+        return update.end, self._lacking(w, update, linear)
 
-    def _tempered(
-        self, w: int, state: FloatArray, belief: _Belief, at: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    ) -> tuple[_Update, FloatArray]:
-        """Update by an interval's samples with as much weight as their linear model deserves, and the end after it.
+    def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
+        """Update by an interval's samples with as much weight as their linear model deserves.
 
-        Where a contact changes, a full step may lead to a motion that agrees less.
+        Where a contact changes, a full step may lead to a motion that agrees less.  The end is simulated.
         """
-        e, J, weights, end = at
         predictor, known = self.predictor, weights > 0.0
-        before = float((weights * np.square(e)).sum())
+        before = float((weights * np.square(linear.errors)).sum())
         for share in _SHARES:
-            update = _Update.of(belief, (e, J, share * weights))
+            update = Update.of(belief, linear, share * weights)
             found, ends = predictor._simulator.errors_and_ends(
                 self.batch(w, state + update.moved, self.inputs), predictor._measurements, threads=1
             )
             after = float(np.where(known, weights * np.square(found[0]), 0.0).sum())
-            if np.abs(ends[0]).max() < _LOST and share * after + update.prior <= share * before * (1.0 + _TINY):
-                return update, ends[0]
-        return _Update.of(belief, (e, J, 0.0 * weights)), end
+            if np.abs(ends[0]).max() < _LOST and share * after + update.prior <= share * before * (1.0 + TINY):
+                nonlinear = np.diag(np.square(ends[0] - update.end))
+                wider = replace(update.belief_of_end, covariance=update.belief_of_end.covariance + nonlinear)
+                return replace(update, end=ends[0], belief_of_end=wider)
+        return Update.of(belief, linear, 0.0 * weights)
 
-    def _count(self, w: int, update: _Update, belief: _Belief) -> None:
+    def _count(self, w: int, update: Update, belief: Belief) -> None:
         """Add an interval's contributions."""
         n_q = self.predictor.intervals.model.n_q
         self.age = self.age + 1 if self.predictor.intervals.following[w] and not self.is_lost else 0
@@ -413,65 +409,66 @@ class _Run:
         noise, k = self.predictor.noise, self.predictor.columns
         return Mixture(noise.sigma[k], noise.pi[k], noise.span[k], noise.floor[k])
 
-    def _propagated(
-        self, w: int, state: FloatArray, update: _Update, at: tuple[FloatArray, FloatArray, FloatArray]
-    ) -> tuple[FloatArray, _Belief]:
-        """State at the end of an interval, and what is known of it."""
-        predictor, belief, (end, F, ends) = self.predictor, update.belief, at
-        n_q, n_x = predictor.intervals.model.n_q, len(state)
-        nonlinear = ends - end - F[:, :n_x] @ update.moved
-        change = np.abs(ends - state - update.moved)
+    def _lacking(self, w: int, update: Update, linear: LinearInterval) -> Belief:
+        """What is known of the state at the end of an interval, with what the model lacks."""
+        predictor, n_q, n_x = self.predictor, self.predictor.intervals.model.n_q, len(update.end)
+        change = np.abs(update.end - self.states[w])
         lacks = predictor.lacks * (change + _SMALL * predictor.unsure)[n_q:]
         # A change of velocity on the way moves coordinates by half of what one at the start does.
-        effect = np.vstack([0.5 * F[:n_q, n_q:n_x], np.eye(n_x - n_q)])
-        spread = (effect * np.square(lacks)) @ effect.T + np.diag(np.square(nonlinear))
-        covariance = F[:, :n_x] @ belief.covariance @ F[:, :n_x].T + spread
-        slopes = F[:, n_x:] + F[:, :n_x] @ belief.slopes
-        return ends, _Belief(0.5 * (covariance + covariance.T), slopes)
+        effect = np.vstack([0.5 * linear.end_of_velocities[:n_q], np.eye(n_x - n_q)])
+        covariance = update.belief_of_end.covariance + (effect * np.square(lacks)) @ effect.T
+        return Belief(0.5 * (covariance + covariance.T), update.belief_of_end.slopes)
 
 
-@dataclass(frozen=True)
-class _Update:
-    """Effect of the samples of an interval.
+class _SpreadRun(_Run):
+    """One pass, with slopes over the spread of the states and of the parameters."""
 
-    Parameters
-    ----------
-    moved : (n_x,) array
-        Change of the state at its start.
-    belief : _Belief
-        After it.
-    prior : float
-        Twice the cost of the change by what was known before.
-    information, score : (n, n) and (n,) array
-        Contributions to those of the parameters.
-    """
+    @cached_property
+    def root(self) -> FloatArray:
+        """Root ``(n, n)`` of the covariance of the parameters; the delay is told apart."""
+        spread, n = self.predictor.spread, len(self.p)
+        assert spread is not None
+        root = np.diag(np.sqrt(np.diag(spread)))
+        root[:n, :n] = np.linalg.cholesky(spread[:n, :n])
+        return np.asarray(root)
 
-    moved: FloatArray
-    belief: _Belief
-    prior: float
-    information: FloatArray
-    score: FloatArray
+    @cached_property
+    def recordings(self) -> tuple[FloatArray, Measurements, IntArray]:
+        """Inputs, measurements and first rows of logs, one after another: the delay, a longer and a shorter one."""
+        predictor, reach = self.predictor, RADIUS * self.root[-1, -1]
+        delays = (0.0, reach, -reach) if predictor.free_delay else (0.0,)
+        inputs = np.concatenate([predictor.acting(predictor.delay + x) for x in delays])
+        measured = np.tile(predictor._measurements.values, (len(delays), 1))
+        firsts = [predictor.intervals.first_of_log + k * len(self.inputs) for k in range(len(delays))]
+        return inputs, Measurements(measured, np.ones(len(measured), bool)), np.concatenate(firsts)
 
-    @classmethod
-    def of(cls, belief: _Belief, samples: tuple[FloatArray, FloatArray, FloatArray]) -> _Update:
-        """Update by errors, their derivatives and weights of an interval's samples."""
-        errors, jacobian, of_samples = samples
-        e, weights, n_x = errors.ravel(), of_samples.ravel(), len(belief.slopes)
-        J: FloatArray = jacobian.reshape(len(e), -1)
-        of_x, of_p = J[:, :n_x], J[:, n_x:] + J[:, :n_x] @ belief.slopes
-        own, scale = np.diag(belief.covariance), np.sqrt(weights)[:, None]
-        root = np.linalg.cholesky(belief.covariance + np.diag(_ROUNDING * own + _TINY**2))
-        # Rows of samples, and of what is known beforehand, in units of its root.
-        above = np.hstack([scale * of_x @ root, scale * of_p, -scale * e[:, None]])
-        R: FloatArray = np.asarray(np.linalg.qr(np.vstack([above, np.eye(n_x, above.shape[1])]), mode="r"))
-        of_state, left = R[:n_x], R[n_x:, n_x:]
-        solved = np.linalg.solve(of_state[:, :n_x], np.column_stack([of_state[:, n_x:], np.eye(n_x)]))
-        slopes, moved, inverse = np.split(solved, [of_p.shape[1], of_p.shape[1] + 1], axis=1)
-        half = root @ inverse
-        return cls(
-            root @ moved[:, 0],
-            _Belief(half @ half.T, belief.slopes - root @ slopes),
-            float(np.square(moved).sum()),
-            left[:, :-1].T @ left[:, :-1],
-            left[:, :-1].T @ left[:, -1],
-        )
+    def linear(self, w: int, state: FloatArray, belief: Belief) -> LinearInterval | None:
+        """An interval's samples and end by differences over the spread; by local slopes where it is too wide."""
+        predictor, one, points = self.predictor, self.predictor.intervals, belief.points(self.root)
+        n_x, n = len(state), len(state) + len(self.p)
+        lower, upper = np.array([(x.lower, x.upper) for x in one.layout.bounds]).T
+        values = np.clip(self.p + points[:, n_x:n], lower, upper)
+        parameters = np.concatenate([np.atleast_2d(one.parameters_of(x, one.log_of[w : w + 1])) for x in values])
+        inputs, measurements, firsts = self.recordings
+        is_later, is_earlier = (points[:, n:] > 0.0).any(axis=1), (points[:, n:] < 0.0).any(axis=1)
+        rows = one.starts[w] + len(self.inputs) * (is_later + 2 * is_earlier)
+        batch = RolloutBatch(parameters, state + points[:, :n_x], inputs, one.dt, rows, one.length, firsts)
+        errors, ends = predictor._simulator.errors_and_ends(batch, measurements, threads=self.threads)
+        if np.isfinite(errors).all() and np.isfinite(ends).all():
+            linear = LinearInterval.over_spread(belief, one.model.n_q, self.root, errors, ends)
+            if self._holds(w, linear):
+                return linear
+        return super().linear(w, state, belief)
+
+    def _holds(self, w: int, linear: LinearInterval) -> bool:
+        """True unless the state may be anywhere, so that what slopes leave is far more than the noise."""
+        one = self.predictor.intervals
+        known = one.known[one.starts[w] : one.starts[w] + one.length][:, self.predictor.columns]
+        left = np.square(linear.left / self._noise.sigma[:, None]).sum(axis=-1)
+        return bool((left * known).sum() <= _LEFT * known.sum() and np.abs(linear.end).max() < _LOST)
+
+    def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
+        """Update by an interval's samples."""
+        if linear.is_local:
+            return super().updated(w, state, belief, linear, weights)
+        return Update.of(belief, linear, weights)

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.methods.lo_diransac.linear_intervals import TINY
 from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
@@ -33,6 +34,10 @@ _SETTLING = 4
 """Passes in which scales settle with parameters that are given."""
 _FASTER, _LEAST_LACKS = 0.75, 1e-4
 """Power of the surprise by which what the model lacks shrinks, and what it lacks at least."""
+_SPREAD, _WIDEST, _SMALL = 10.0, 0.25, 0.01
+"""Spread of a parameter over which slopes are taken, standard errors; at most, of its size; size at least, its unit."""
+_SPREAD_PASSES, _ALIKE = 12, 0.99
+"""Passes with slopes over the spread at most; correlation of two parameters in it at most."""
 _EARLY, _REACH = 3, {"m": 0.05, "rad": 0.2}
 """Passes before a delay is estimated, for which wrong parameters would stand; step of other parameters at most."""
 
@@ -119,6 +124,100 @@ def minimised(
     return Minimum(predictor, p, now, converged, latest.covariance())
 
 
+def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Minimum], None] | None = None) -> Minimum:
+    """Parameters with the likeliest predictions by slopes over the spread, if the samples are likelier with these.
+
+    Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
+    standard errors do not see.  The mean of the latest passes counts; it is no surer than the local end, and what it
+    differs from that is an error of either.
+
+    Parameters
+    ----------
+    found : Minimum
+        With local slopes.
+    outliers : bool
+        Whether the fraction of outliers is estimated.
+    progress : callable, optional
+        Called with the number of each pass, and what was found so far.
+
+    Returns
+    -------
+    Minimum
+    """
+    layout, p, converged = found.predictor.intervals.layout, found.parameters, False
+    none = np.zeros(int(found.predictor.free_delay))
+    precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
+    widths = _widths(found)
+    predictor = replace(found.predictor, spread=with_widths(found.covariance, widths))
+    passes, latest = list[Minimum](), _Latest((), (), ())
+    for k in range(_SPREAD_PASSES):
+        now = predictor.over_logs(p)
+        if not passes and (_is_alike(now, found.last) or is_worse(now.losses, found.last.losses)):
+            return found
+        pull = precision * np.concatenate([layout.prior_mean - p, none])
+        step = now.step(precision, pull, _bounds_of_step(predictor, p))
+        covariance = _no_surer(now.robust_covariance(precision), found.covariance)
+        latest = latest.and_(step, covariance, now.losses)
+        passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
+        if progress is not None:
+            progress(k, passes[-1])
+        converged, is_likelier = latest.are_at_rest(_CONVERGED), _median_loss(passes) < _median_loss([found])
+        if converged or (len(passes) == _LATEST and not is_likelier):
+            break
+        p, predictor = _moved(_with_scales(predictor, now, outliers=outliers), p, step)
+        predictor = replace(predictor, spread=with_widths(covariance, widths))
+    if not is_likelier:
+        return found
+    likeliest = min(passes, key=lambda x: float(x.last.losses.sum()))
+    mean = np.mean([_with_delay(x) for x in passes], axis=0)
+    other = mean - _with_delay(found)
+    p, predictor = _moved(likeliest.predictor, likeliest.parameters, mean - _with_delay(likeliest))
+    return Minimum(predictor, p, likeliest.last, converged, latest.covariance() + 0.25 * np.outer(other, other))
+
+
+def _no_surer(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """Covariance with standard deviations that are at least those of another one."""
+    more = np.sqrt(np.maximum(1.0, np.diag(least) / np.maximum(np.diag(covariance), TINY**2)))
+    return np.asarray(covariance * np.outer(more, more))
+
+
+def _is_alike(now: Pass, before: Pass) -> bool:
+    """True if passes differ by less than counts."""
+    return bool(np.abs(now.losses - before.losses).sum() < _LIKELIER)
+
+
+def _median_loss(passes: Sequence[Minimum]) -> float:
+    return float(np.median([x.last.losses.sum() for x in passes]))
+
+
+def _widths(found: Minimum) -> FloatArray:
+    """Standard deviations ``(n,)`` of the parameters, and of a delay, over which slopes are taken."""
+    bounds, errors = found.predictor.intervals.layout.bounds, np.sqrt(np.diag(found.covariance))
+    sizes = [abs(p) if x.positive and p else max(abs(p), _SMALL) for p, x in zip(found.parameters, bounds, strict=True)]
+    widest = _WIDEST * np.array([*sizes, *[1.0] * found.predictor.free_delay])
+    return np.where(errors > 0.0, np.minimum(_SPREAD * errors, widest), widest)
+
+
+def with_widths(covariance: FloatArray, widths: FloatArray) -> FloatArray:
+    """Covariance ``(n, n)`` with nearly the correlations of another one, so that every direction has a width.
+
+    Parameters
+    ----------
+    covariance : (n, n) array
+    widths : (n,) array
+        Its standard deviations.
+    """
+    errors = np.sqrt(np.diag(covariance))
+    scale = np.divide(widths, errors, out=np.zeros_like(errors), where=errors > 0.0)
+    correlated = _ALIKE * covariance * np.outer(scale, scale)
+    return np.asarray(correlated + np.diag(np.square(widths) - np.diag(correlated)))
+
+
+def _with_delay(found: Minimum) -> FloatArray:
+    """Parameters, and the delay if it is estimated."""
+    return np.append(found.parameters, [found.predictor.delay] * found.predictor.free_delay)
+
+
 @dataclass(frozen=True)
 class _Latest:
     """The latest passes: where contacts begin a step earlier or later, steps do not end, and information jumps.
@@ -202,7 +301,7 @@ def _noise_after(predictor: Predictor, now: Pass, *, outliers: bool) -> Mixture:
     return predictor.noise.updated(now.residuals, known, inlying, outliers=outliers)
 
 
-def _bounds_of_step(predictor: Predictor, p: FloatArray, *, held: bool) -> tuple[FloatArray, FloatArray]:
+def _bounds_of_step(predictor: Predictor, p: FloatArray, *, held: bool = False) -> tuple[FloatArray, FloatArray]:
     """Least and largest step: within the bounds, positive parameters at most halved or doubled, a delay by a sample."""
     low, high = np.full(len(p), -np.inf), np.full(len(p), np.inf)
     for j, bounds in enumerate(predictor.intervals.layout.bounds):

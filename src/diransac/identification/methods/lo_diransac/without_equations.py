@@ -20,7 +20,7 @@ from diransac.identification.finding import Finding
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.diagnosing import diagnosis_of
 from diransac.identification.methods.lo_diransac.following import Predictor
-from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, settled
+from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised, over_spread, settled
 from diransac.identification.methods.lo_diransac.preparation import cut, screened
 from diransac.identification.regression.uncertainty import CLEAR
 
@@ -99,6 +99,11 @@ def estimated_by_simulation(
             raise
         limited = True
     found = min([*ends, *so_far] if limited else ends, key=lambda end: float(end.last.losses.sum()))
+    if _follows(found) and not limited:
+        try:
+            found = over_spread(found, outliers=settings.outliers, progress=progress)
+        except TimeLimitError:
+            limited = True
     ended = TIME_LIMIT if limited else "converged" if found.converged else "limit of passes"
     if found.last.lost.sum() > 0.5 * 10.0 * float(intervals.known.sum()):
         raise IdentificationError(
