@@ -32,7 +32,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | `competition.py`, `sources.py`, `arbiter.py` | estimates by other means, and their predictions of held-out blocks |
 | `simulation_error.py`, `segments.py` | one of them: simulation error of segments |
 | **models without equations** | |
-| `without_equations.py`, `prediction_error.py`, `following.py`, `linear_intervals.py` | models that a simulator alone knows |
+| `without_equations.py`, `prediction_error.py`, `following.py`, `linear_intervals.py` | by a simulator alone |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured
