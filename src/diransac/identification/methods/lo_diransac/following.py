@@ -48,7 +48,7 @@ _FIRST_NOISE, _LEAST_NOISE = 3.0, 1e-3
 """Noise of a signal before anything is fitted, over that of its bends; at least, over its spread."""
 _LOST = 1e4
 _FOLLOWED = 0.5
-"""Part of a signal's samples that must agree: if fewer do in two intervals, the motion begins anew with the samples."""
+"""Part of the samples that must agree: if fewer do in two intervals, the motion begins anew with the samples."""
 _LEFT = 4.0
 """Mean variance that slopes over the spread leave, over that of the noise, at most."""
 _SHARES = (1.0, 0.25, 0.06, 0.015, 0.004)
@@ -301,7 +301,7 @@ class _Run:
         self.information, self.losses, self.lost = np.zeros((len(one), self.n, self.n)), *np.zeros((2, len(one)))
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
         self.surprise, self.age, self.is_lost = list[FloatArray](), 0, False
-        self.contradicts = np.zeros(len(predictor.columns), bool)
+        self.contradicts = np.zeros(1, bool)
         self.threads = one.threads if one.threads > 1 else default_threads()
 
     def result(self) -> Pass:
@@ -358,7 +358,7 @@ class _Run:
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
         inlying = noise.inlying(e / wide, known)
         weights, before = inlying / np.square(noise.sigma), self.contradicts & bool(one.following[w])
-        self.contradicts = inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0)
+        self.contradicts = self.contradicting(inlying, known)
         self.is_lost = bool((self.contradicts & before).any())
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
         update = self.updated(w, state, belief, linear, weights)
@@ -369,6 +369,10 @@ class _Run:
         self.residuals[rows, columns] = np.where(known, update.residuals, 0.0)
         self.is_lost |= bool(np.abs(update.end).max() > _LOST)
         return update.end, self._lacking(w, update, linear)
+
+    def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
+        """True if too few samples of an interval agree."""
+        return np.array([inlying.sum() < _FOLLOWED * known.sum()])
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
         """Update by an interval's samples with as much weight as their linear model deserves.
@@ -466,6 +470,10 @@ class _SpreadRun(_Run):
         known = one.known[one.starts[w] : one.starts[w] + one.length][:, self.predictor.columns]
         left = np.square(linear.left / self._noise.sigma[:, None]).sum(axis=-1)
         return bool((left * known).sum() <= _LEFT * known.sum() and np.abs(linear.end).max() < _LOST)
+
+    def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
+        """Mask of the signals of which too few samples agree: updates whose ends are not tried may lose one alone."""
+        return np.asarray(inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0))
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
         """Update by an interval's samples."""
