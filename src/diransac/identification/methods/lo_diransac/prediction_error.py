@@ -128,8 +128,8 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     """Parameters with the likeliest predictions by slopes over the spread, if the samples are likelier with these.
 
     Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
-    standard errors do not see.  The mean of the latest passes counts; it is no surer than the local end, and what it
-    differs from that is an error of either.
+    standard errors do not see.  The mean of the latest passes counts; it is no surer than a local end nearby, and what
+    it differs from that is an error of either.
 
     Parameters
     ----------
@@ -144,10 +144,10 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     -------
     Minimum
     """
-    layout, p, converged = found.predictor.intervals.layout, found.parameters, False
+    layout, p = found.predictor.intervals.layout, found.parameters
     none = np.zeros(int(found.predictor.free_delay))
     precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
-    widths = _widths(found)
+    widths, local, errors = _widths(found), _with_delay(found.predictor, p), np.sqrt(np.diag(found.covariance))
     predictor = replace(found.predictor, spread=with_widths(found.covariance, widths))
     passes, latest = list[Minimum](), _Latest((), (), ())
     for k in range(_SPREAD_PASSES):
@@ -156,28 +156,32 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
             return found
         pull = precision * np.concatenate([layout.prior_mean - p, none])
         step = now.step(precision, pull, _bounds_of_step(predictor, p))
-        covariance = _no_surer(now.robust_covariance(precision), found.covariance)
+        covariance = now.robust_covariance(precision)
+        if (np.abs(_with_delay(predictor, p) - local) <= CLEAR * errors).all():
+            covariance = _no_surer(covariance, errors)
         latest = latest.and_(step, covariance, now.losses)
         passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
         if progress is not None:
             progress(k, passes[-1])
-        converged, is_likelier = latest.are_at_rest(_CONVERGED), _median_loss(passes) < _median_loss([found])
-        if converged or (len(passes) == _LATEST and not is_likelier):
+        is_at_rest, is_likelier = latest.are_at_rest(_CONVERGED), _median_loss(passes) < _median_loss([found])
+        if is_at_rest or (len(passes) == _LATEST and not is_likelier):
             break
         p, predictor = _moved(_with_scales(predictor, now, outliers=outliers), p, step)
         predictor = replace(predictor, spread=with_widths(covariance, widths))
     if not is_likelier:
         return found
     likeliest = min(passes, key=lambda x: float(x.last.losses.sum()))
-    mean = np.mean([_with_delay(x) for x in passes], axis=0)
-    other = mean - _with_delay(found)
-    p, predictor = _moved(likeliest.predictor, likeliest.parameters, mean - _with_delay(likeliest))
-    return Minimum(predictor, p, likeliest.last, converged, latest.covariance() + 0.25 * np.outer(other, other))
+    mean = np.mean([_with_delay(x.predictor, x.parameters) for x in passes], axis=0)
+    other = mean - local
+    p, predictor = likeliest.parameters, likeliest.predictor
+    p, predictor = _moved(predictor, p, mean - _with_delay(predictor, p))
+    covariance = latest.covariance() + 0.25 * np.outer(other, other)
+    return Minimum(predictor, p, likeliest.last, found.converged and is_at_rest, covariance)
 
 
 def _no_surer(covariance: FloatArray, least: FloatArray) -> FloatArray:
-    """Covariance with standard deviations that are at least those of another one."""
-    more = np.sqrt(np.maximum(1.0, np.diag(least) / np.maximum(np.diag(covariance), TINY**2)))
+    """Covariance with standard deviations that are at least others ``(n,)``."""
+    more = np.maximum(1.0, least / np.maximum(np.sqrt(np.diag(covariance)), TINY))
     return np.asarray(covariance * np.outer(more, more))
 
 
@@ -213,9 +217,9 @@ def with_widths(covariance: FloatArray, widths: FloatArray) -> FloatArray:
     return np.asarray(correlated + np.diag(np.square(widths) - np.diag(correlated)))
 
 
-def _with_delay(found: Minimum) -> FloatArray:
+def _with_delay(predictor: Predictor, p: FloatArray) -> FloatArray:
     """Parameters, and the delay if it is estimated."""
-    return np.append(found.parameters, [found.predictor.delay] * found.predictor.free_delay)
+    return np.append(p, [predictor.delay] * predictor.free_delay)
 
 
 @dataclass(frozen=True)
