@@ -296,10 +296,49 @@ def test_contacts_that_chatter_are_told_by_slopes_over_the_spread(
     ((local, spread),) = ends
     assert spread.last.losses.sum() < local.last.losses.sum() - 100.0
     assert (np.diag(spread.covariance) >= np.diag(local.covariance)).all()
+    at_end = spread.predictor.over_logs(spread.parameters).losses.sum()
+    assert at_end == pytest.approx(spread.last.losses.sum(), rel=1e-9)
     for name, (low, high) in result.intervals(0.95).items():
         assert low <= truth[name] <= high
         assert high - low < 0.4 * truth[name]
     assert result.verdict != "do not rely on this"
+
+
+@pytest.mark.parametrize("damping", [2.0, 0.0])
+def test_slopes_over_the_spread_are_local_ones_of_a_linear_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damping: float
+) -> None:
+    """At a bound, as a damping of 0, too: points beyond it are at it."""
+    ends: list[Minimum] = []
+
+    def over_spread(found: Minimum, **options: Any) -> Minimum:
+        ends.append(found)
+        return prediction_error.over_spread(found, **options)
+
+    monkeypatch.setattr(without_equations, "over_spread", over_spread)
+    log = log_of_carts(carts(1.0, damping=damping), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=1.0))
+    names = ["body/cart0.mass", "joint/x0.damping"]
+    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=names), log)
+    at = np.array([1.0, damping])
+    wide = prediction_error.with_widths(ends[0].covariance, np.full(3, 0.01))
+    over = replace(ends[0].predictor, spread=wide).over_logs(at)
+    local = ends[0].predictor.over_logs(at)
+    np.testing.assert_allclose(over.information[:2, :2], local.information[:2, :2], rtol=0.02)
+    assert over.losses.sum() == pytest.approx(local.losses.sum(), abs=1.0)
+    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("column", ["x0", "x0_dot"])
+def test_a_column_of_noise_does_not_begin_the_motion_anew(tmp_path: Path, column: str) -> None:
+    log = log_of_carts(carts(1.0, damping=2.0), 20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME), 0)
+    columns = {name: log[name] for name in log.names}
+    columns[column] = np.random.default_rng(0).uniform(-1.0, 1.0, len(log))
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=1.0))
+    model = dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass", "joint/x0.damping"])
+    result = dr.identify(model, dr.Log.from_arrays(log.time, columns))
+    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=0.01)
+    assert result.parameters["joint/x0.damping"] == pytest.approx(2.0, rel=0.02)
 
 
 CART = """<body name="cart{k}"><joint name="x{k}" type="slide" axis="1 0 0" damping="{d}"/>

@@ -371,8 +371,13 @@ class _Run:
         return update.end, self._lacking(w, update, linear)
 
     def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
-        """True if too few samples of an interval agree."""
-        return np.array([inlying.sum() < _FOLLOWED * known.sum()])
+        """Mask of signals of which too few samples agree; all of them if too few of all do.
+
+        Alone, only a state counts that was followed, and is not an outlier mostly: an update may lose it.
+        """
+        few = inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0)
+        alone = (self.predictor.columns < self.states.shape[1]) & (self._noise.pi <= _FOLLOWED)
+        return np.asarray((few & alone & (self.age >= _BEGINNING)) | (inlying.sum() < _FOLLOWED * known.sum()))
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
         """Update by an interval's samples with as much weight as their linear model deserves.
@@ -429,7 +434,7 @@ class _SpreadRun(_Run):
 
     @cached_property
     def root(self) -> FloatArray:
-        """Root ``(n, n)`` of the covariance of the parameters; the delay is told apart."""
+        """Root ``(n, n)`` of the covariance of the parameters, and of the delay, which is uncorrelated."""
         spread, n = self.predictor.spread, len(self.p)
         assert spread is not None
         root = np.diag(np.sqrt(np.diag(spread)))
@@ -452,6 +457,10 @@ class _SpreadRun(_Run):
         n_x, n = len(state), len(state) + len(self.p)
         lower, upper = np.array([(x.lower, x.upper) for x in one.layout.bounds]).T
         values = np.clip(self.p + points[:, n_x:n], lower, upper)
+        within = values - self.p - points[:, n_x:n]
+        points += np.hstack([within @ belief.slopes[:, : len(self.p)].T, within, np.zeros_like(points[:, n:])])
+        above, below = np.split(points[1:], 2)
+        root = (above - below)[n_x:, n_x:].T / (2.0 * RADIUS)
         parameters = np.concatenate([np.atleast_2d(one.parameters_of(x, one.log_of[w : w + 1])) for x in values])
         inputs, measurements, firsts = self.recordings
         is_later, is_earlier = (points[:, n:] > 0.0).any(axis=1), (points[:, n:] < 0.0).any(axis=1)
@@ -459,7 +468,7 @@ class _SpreadRun(_Run):
         batch = RolloutBatch(parameters, state + points[:, :n_x], inputs, one.dt, rows, one.length, firsts)
         errors, ends = predictor._simulator.errors_and_ends(batch, measurements, threads=self.threads)
         if np.isfinite(errors).all() and np.isfinite(ends).all():
-            linear = LinearInterval.over_spread(belief, one.model.n_q, self.root, errors, ends)
+            linear = LinearInterval.over_spread(belief, one.model.n_q, root, errors, ends)
             if self._holds(w, linear):
                 return linear
         return super().linear(w, state, belief)
@@ -470,10 +479,6 @@ class _SpreadRun(_Run):
         known = one.known[one.starts[w] : one.starts[w] + one.length][:, self.predictor.columns]
         left = np.square(linear.left / self._noise.sigma[:, None]).sum(axis=-1)
         return bool((left * known).sum() <= _LEFT * known.sum() and np.abs(linear.end).max() < _LOST)
-
-    def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
-        """Mask of the signals of which too few samples agree: updates whose ends are not tried may lose one alone."""
-        return np.asarray(inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0))
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
         """Update by an interval's samples."""

@@ -67,12 +67,12 @@ class LinearInterval:
     ----------
     errors : (n_rows, n_s) array
         Simulated less measured.
-    of_state, of_parameters, left : (n_rows, n_s, n) arrays
+    of_state, of_parameters, left : (n_rows, n_s, n_x), (n_rows, n_s, n) and (n_rows, n_s, n_x or 0) arrays
         Changes with the state, per unit of its root, and with the parameters, with which the state's mean moves; what
         slopes leave, per standard deviation of noises that are independent.
     end : (n_x,) array
         State after the last row.
-    end_of_state, end_of_parameters, end_left : (n_x, n) arrays
+    end_of_state, end_of_parameters, end_left : (n_x, n_x), (n_x, n) and (n_x, n_x or 0) arrays
     end_of_velocities : (n_x, n_v) array
         Change of the end with the velocities at the start, per unit of these.
     """

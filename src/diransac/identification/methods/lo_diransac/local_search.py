@@ -138,8 +138,8 @@ class LocalSearch:
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
         rival : Explanation, optional
-            Outcome of another search.  It is that of this one, too, where the first fits of both are as likely: what
-            follows would be the same.  Where it was likelier before errors of the recordings were sought, this search
+            Outcome of another search.  It is taken for that of this one, too, where the first fits of both are as
+            likely.  Where it was likelier before errors of the recordings were sought, this search
             ends there.
 
         Returns

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.linear_intervals import TINY
 from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
     from diransac.identification.methods.lo_diransac.mixture import Mixture
@@ -128,8 +127,8 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     """Parameters with the likeliest predictions by slopes over the spread, if the samples are likelier with these.
 
     Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
-    standard errors do not see.  The mean of the latest passes counts; it is no surer than a local end nearby, and what
-    it differs from that is an error of either.
+    standard errors do not see.  The mean of the latest passes counts, or the likeliest of them if their mean loses the
+    motion; it is no surer than a local end nearby, and what it differs from that is an error of either.
 
     Parameters
     ----------
@@ -163,26 +162,34 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
         passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
         if progress is not None:
             progress(k, passes[-1])
-        is_at_rest, is_likelier = latest.are_at_rest(_CONVERGED), _median_loss(passes) < _median_loss([found])
+        is_at_rest, is_likelier = (
+            latest.are_at_rest(_CONVERGED),
+            float(np.median([_loss(x) for x in passes])) < _loss(found),
+        )
         if is_at_rest or (len(passes) == _LATEST and not is_likelier):
             break
         p, predictor = _moved(_with_scales(predictor, now, outliers=outliers), p, step)
         predictor = replace(predictor, spread=with_widths(covariance, widths))
     if not is_likelier:
         return found
-    likeliest = min(passes, key=lambda x: float(x.last.losses.sum()))
+    likeliest = min(passes, key=_loss)
     mean = np.mean([_with_delay(x.predictor, x.parameters) for x in passes], axis=0)
-    other = mean - local
+    other, covariance = mean - local, latest.covariance()
     p, predictor = likeliest.parameters, likeliest.predictor
     p, predictor = _moved(predictor, p, mean - _with_delay(predictor, p))
-    covariance = latest.covariance() + 0.25 * np.outer(other, other)
-    return Minimum(predictor, p, likeliest.last, found.converged and is_at_rest, covariance)
+    end = Minimum(predictor, p, predictor.over_logs(p), False, covariance)
+    return replace(
+        end if _loss(end) < _loss(found) else likeliest,
+        converged=found.converged and is_at_rest,
+        covariance=covariance + 0.25 * np.outer(other, other),
+    )
 
 
 def _no_surer(covariance: FloatArray, least: FloatArray) -> FloatArray:
     """Covariance with standard deviations that are at least others ``(n,)``."""
-    more = np.maximum(1.0, least / np.maximum(np.sqrt(np.diag(covariance)), TINY))
-    return np.asarray(covariance * np.outer(more, more))
+    own = np.sqrt(np.diag(covariance))
+    more = np.divide(np.maximum(own, least), own, out=np.zeros_like(own), where=own > 0.0)
+    return np.asarray(covariance * np.outer(more, more) + np.diag(np.where(own > 0.0, 0.0, np.square(least))))
 
 
 def _is_alike(now: Pass, before: Pass) -> bool:
@@ -190,8 +197,8 @@ def _is_alike(now: Pass, before: Pass) -> bool:
     return bool(np.abs(now.losses - before.losses).sum() < _LIKELIER)
 
 
-def _median_loss(passes: Sequence[Minimum]) -> float:
-    return float(np.median([x.last.losses.sum() for x in passes]))
+def _loss(found: Minimum) -> float:
+    return float(found.last.losses.sum())
 
 
 def _widths(found: Minimum) -> FloatArray:
