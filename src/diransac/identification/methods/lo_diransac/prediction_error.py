@@ -149,27 +149,28 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     widths, local, errors = _widths(found), _with_delay(found.predictor, p), np.sqrt(np.diag(found.covariance))
     predictor = replace(found.predictor, spread=with_widths(found.covariance, widths))
     passes, latest = list[Minimum](), _Latest((), (), ())
+    now, is_at_rest, is_likelier = predictor.over_logs(p), False, False
+    if _is_alike(now, found.last) or is_worse(now.losses, found.last.losses):
+        return found
     for k in range(_SPREAD_PASSES):
-        now = predictor.over_logs(p)
-        if not passes and (_is_alike(now, found.last) or is_worse(now.losses, found.last.losses)):
-            return found
         pull = precision * np.concatenate([layout.prior_mean - p, none])
-        step = now.step(precision, pull, _bounds_of_step(predictor, p))
-        covariance = now.robust_covariance(precision)
+        step, covariance = now.step(precision, pull, _bounds_of_step(predictor, p)), now.robust_covariance(precision)
         if (np.abs(_with_delay(predictor, p) - local) <= CLEAR * errors).all():
             covariance = _no_surer(covariance, errors)
-        latest = latest.and_(step, covariance, now.losses)
-        passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
-        if progress is not None:
+        if k:  # the first is of the local end
+            latest = latest.and_(step, covariance, now.losses)
+            passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
+            is_at_rest, is_likelier = (
+                latest.are_at_rest(_CONVERGED),
+                np.median([_loss(x) for x in passes]) < _loss(found),
+            )
+        if passes and progress is not None:
             progress(k, passes[-1])
-        is_at_rest, is_likelier = (
-            latest.are_at_rest(_CONVERGED),
-            float(np.median([_loss(x) for x in passes])) < _loss(found),
-        )
         if is_at_rest or (len(passes) == _LATEST and not is_likelier):
             break
         p, predictor = _moved(_with_scales(predictor, now, outliers=outliers), p, step)
         predictor = replace(predictor, spread=with_widths(covariance, widths))
+        now = predictor.over_logs(p)
     if not is_likelier:
         return found
     likeliest = min(passes, key=_loss)
