@@ -373,10 +373,12 @@ class _Run:
     def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
         """Mask of signals of which too few samples agree; all of them if too few of all do.
 
-        Alone, only a state counts that was followed, and is not an outlier mostly: an update may lose it.
+        An update may lose a state alone.  It counts if it was followed, is not an outlier mostly, and if all coordinates
+        are measured, so that nothing is forgotten.
         """
+        columns, n_q = self.predictor.columns, self.predictor.intervals.model.n_q
         few = inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0)
-        alone = (self.predictor.columns < self.states.shape[1]) & (self._noise.pi <= _FOLLOWED)
+        alone = (columns < self.states.shape[1]) & (self._noise.pi <= _FOLLOWED) & (np.sum(columns < n_q) == n_q)
         return np.asarray((few & alone & (self.age >= _BEGINNING)) | (inlying.sum() < _FOLLOWED * known.sum()))
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
