@@ -373,8 +373,8 @@ class _Run:
     def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
         """Mask of signals of which too few samples agree; all of them if too few of all do.
 
-        An update may lose a state alone.  It counts if it was followed, is not an outlier mostly, and if all coordinates
-        are measured, so that nothing is forgotten.
+        An update may lose a state alone.  It counts if it was followed, is not an outlier mostly, and if all
+        coordinates are measured, so that nothing is forgotten.
         """
         columns, n_q = self.predictor.columns, self.predictor.intervals.model.n_q
         few = inlying.sum(axis=0) < _FOLLOWED * known.sum(axis=0)
