@@ -258,7 +258,7 @@ class _Latest:
 
     def are_at_rest(self, most: float) -> bool:
         """True if passes become no likelier, and the mean step is at most so many standard errors, but for chance."""
-        if len(self.steps) < _LATEST or is_worse(self.losses[0], self.losses[-1]):
+        if len(self.steps) < _LATEST or is_worse(self.losses[0], self.losses[-1], deviations=1.0):
             return False
         mean, scatter = np.abs(np.mean(self.steps, axis=0)), np.std(self.steps, axis=0, ddof=1)
         chance = 2.0 * np.minimum(scatter, self.errors) / np.sqrt(_LATEST)
@@ -272,16 +272,18 @@ class _Latest:
         return np.asarray(self.covariances[-1] * np.outer(more, more) + np.diag(wander))
 
 
-def is_worse(after: FloatArray, before: FloatArray) -> bool:
+def is_worse(after: FloatArray, before: FloatArray, *, deviations: float = CLEAR) -> bool:
     """True if losses are larger by more than chance: where a contact begins a step earlier, that of an interval jumps.
 
     Parameters
     ----------
     after, before : (W,) array
         Of the same intervals, nats.
+    deviations : float, optional
+        Standard deviations that are no chance.
     """
     more = after - before
-    return bool(more.sum() > max(_LIKELIER, CLEAR * np.sqrt(np.square(more).sum())))
+    return bool(more.sum() > max(_LIKELIER, deviations * np.sqrt(np.square(more).sum())))
 
 
 def settled(predictor: Predictor, p: FloatArray) -> tuple[Predictor, Pass]:
