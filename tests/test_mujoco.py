@@ -407,6 +407,15 @@ def test_a_fit_that_does_not_follow_the_motion_begins_elsewhere(
     assert (str(result.verdict) == "do not rely on this") == (failing == 9)
 
 
+def check_a_cart_at_the_time_limit(tmp_path: Path) -> None:
+    """Check that a mass is found, and that the time limit is said."""
+    log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
+    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
+    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)
+    assert result.stop_reason == TIME_LIMIT
+    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+
+
 def test_a_time_limit_during_a_further_start_is_said_and_the_best_so_far_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -421,11 +430,7 @@ def test_a_time_limit_during_a_further_start_is_said_and_the_best_so_far_is_kept
         raise TimeLimitError
 
     monkeypatch.setattr(without_equations, "minimised", fitted)
-    log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
-    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
-    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)
-    assert result.stop_reason == TIME_LIMIT
-    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+    check_a_cart_at_the_time_limit(tmp_path)
 
 
 def test_a_time_limit_during_passes_over_the_spread_keeps_the_local_end(
@@ -435,11 +440,7 @@ def test_a_time_limit_during_passes_over_the_spread_keeps_the_local_end(
         raise TimeLimitError
 
     monkeypatch.setattr(without_equations, "over_spread", over_spread)
-    log = log_of_carts(carts(1.0, damping=2.0), (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400], 0)
-    (tmp_path / "carts.xml").write_text(carts(1.5, damping=2.0))
-    result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=["body/cart0.mass"]), log)
-    assert result.stop_reason == TIME_LIMIT
-    assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+    check_a_cart_at_the_time_limit(tmp_path)
 
 
 def test_parameters_are_those_without_a_delay_that_is_not_significant(tmp_path: Path) -> None:

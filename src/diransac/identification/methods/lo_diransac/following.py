@@ -421,7 +421,7 @@ class _Run:
         return Mixture(noise.sigma[k], noise.pi[k], noise.span[k], noise.floor[k])
 
     def _lacking(self, w: int, update: Update, linear: LinearInterval) -> Belief:
-        """What is known of the state at the end of an interval, with what the model lacks."""
+        """Belief of the state at the end of an interval, with what the model lacks."""
         predictor, n_q, n_x = self.predictor, self.predictor.intervals.model.n_q, len(update.end)
         change = np.abs(update.end - self.states[w])
         lacks = predictor.lacks * (change + _SMALL * predictor.unsure)[n_q:]

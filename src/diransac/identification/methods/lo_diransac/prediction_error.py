@@ -95,13 +95,11 @@ def minimised(
     -------
     Minimum
     """
-    layout, known = predictor.intervals.layout, predictor.intervals.known
+    known = predictor.intervals.known
     converged, now, reach, latest = False, predictor.over_logs(p), 1.0, _Latest((), (), ())
     for k in range(_PASSES):
         held = predictor.free_delay and k < _EARLY
-        none = np.zeros(int(predictor.free_delay))
-        precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
-        pull = precision * np.concatenate([layout.prior_mean - p, none])
+        precision, pull = _prior(predictor, p)
         following = _with_scales(predictor, now, outliers=outliers)
         step = now.step(precision, pull, _bounds_of_step(predictor, p, held=held))
         latest = latest.and_(step, now.robust_covariance(precision), now.losses)
@@ -143,27 +141,23 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     -------
     Minimum
     """
-    layout, p = found.predictor.intervals.layout, found.parameters
-    none = np.zeros(int(found.predictor.free_delay))
-    precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
-    widths, local, errors = _widths(found), _with_delay(found.predictor, p), np.sqrt(np.diag(found.covariance))
+    p, widths, errors = found.parameters, _widths(found), np.sqrt(np.diag(found.covariance))
+    local = _with_delay(found.predictor, p)
     predictor = replace(found.predictor, spread=with_widths(found.covariance, widths))
     passes, latest = list[Minimum](), _Latest((), (), ())
     now, is_at_rest, is_likelier = predictor.over_logs(p), False, False
     if _is_alike(now, found.last) or is_worse(now.losses, found.last.losses):
         return found
     for k in range(_SPREAD_PASSES):
-        pull = precision * np.concatenate([layout.prior_mean - p, none])
+        precision, pull = _prior(predictor, p)
         step, covariance = now.step(precision, pull, _bounds_of_step(predictor, p)), now.robust_covariance(precision)
         if (np.abs(_with_delay(predictor, p) - local) <= CLEAR * errors).all():
             covariance = _no_surer(covariance, errors)
         if k:  # the first is of the local end
             latest = latest.and_(step, covariance, now.losses)
             passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
-            is_at_rest, is_likelier = (
-                latest.are_at_rest(_CONVERGED),
-                np.median([_loss(x) for x in passes]) < _loss(found),
-            )
+            is_at_rest = latest.are_at_rest(_CONVERGED)
+            is_likelier = bool(np.median([_loss(x) for x in passes]) < _loss(found))
         if passes and progress is not None:
             progress(k, passes[-1])
         if is_at_rest or (len(passes) == _LATEST and not is_likelier):
@@ -184,6 +178,13 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
         converged=found.converged and is_at_rest,
         covariance=covariance + 0.25 * np.outer(other, other),
     )
+
+
+def _prior(predictor: Predictor, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Precision ``(n,)`` of the prior of the parameters, and its pull; 0 of a delay."""
+    layout, none = predictor.intervals.layout, np.zeros(int(predictor.free_delay))
+    precision = np.concatenate([1.0 / np.square(layout.prior_std), none])
+    return precision, precision * np.concatenate([layout.prior_mean - p, none])
 
 
 def _no_surer(covariance: FloatArray, least: FloatArray) -> FloatArray:
