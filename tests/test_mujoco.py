@@ -20,6 +20,7 @@ from diransac.identification.methods.lo_diransac import prediction_error, withou
 from diransac.identification.methods.lo_diransac.following import Predictor
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised
 from diransac.model.mjcf import MujocoModel, calibrated_text
+from diransac.model.mjcf.model import write
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 mujoco = pytest.importorskip("mujoco", reason="MODELS OF MUJOCO NOT CHECKED: mujoco is missing")
@@ -171,8 +172,8 @@ def test_a_mask_that_names_nothing_is_refused(hopper_file: Path, masks: list[str
         ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", "cannot be compiled"),
         (
             '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>'
-            '<general name="slow" joint="j" dyntype="filter" dynprm="1"/></actuator></mujoco>',
-            "states besides positions and velocities (slow)",
+            '<motor name="slow" joint="j" delay="0.01" nsample="6"/></actuator></mujoco>',
+            "states besides positions, velocities and activations",
         ),
     ],
 )
@@ -457,6 +458,34 @@ def test_parameters_are_those_without_a_delay_that_is_not_significant(tmp_path: 
         assert result.standard_errors[name] > known.standard_errors[name]
 
 
+def test_a_drive_with_a_lag_has_a_state_and_its_time_constant_is_found(tmp_path: Path) -> None:
+    drive = 'general dyntype="filter" dynprm="{}" gainprm="{}"'
+    u = np.cumsum(np.random.default_rng(1).standard_normal(1500)) / 20.0
+    log = log_of_carts(carts(1.0, damping=2.0, drive=drive.format(0.13, 26.0)), u, 1)
+    (tmp_path / "carts.xml").write_text(carts(1.0, damping=1.0, drive=drive.format(0.08, 20.0)))
+    unknown = ["actuator/push0.dynprm[0]", "actuator/push0.gainprm[0]", "joint/x0.damping"]
+    model = dr.models.mujoco(tmp_path / "carts.xml", unknown=unknown)
+    assert model.state == ("x0", "x0_dot", "push0_activation")
+    result = dr.identify(model, log)
+    for (name, found), true in zip(result.parameters.items(), (0.13, 26.0, 2.0), strict=True):
+        low, high = result.intervals(0.95)[name]
+        assert found == pytest.approx(true, rel=0.02)
+        assert low < true < high
+    start = dict.fromkeys(model.state, 0.0)
+    assert "push0_activation" in dr.simulate(result, log, initial_state=start).names
+
+
+def test_inertias_of_shapes_that_are_only_looked_at_are_kept(tmp_path: Path) -> None:
+    inertia = '<inertial pos="0 0 0" mass="9" diaginertia="1 1 1"/>'
+    shape = '<geom size="0.1" mass="2" contype="0" conaffinity="0"/>'
+    body = f'<body name="b"><joint name="turn"/>{inertia}{shape}</body>'
+    text = f'<mujoco><compiler inertiafromgeom="true"/><worldbody>{body}</worldbody></mujoco>'
+    (tmp_path / "b.xml").write_text(text)
+    made = dr.models.mujoco(tmp_path / "b.xml", unknown=["body/b.mass"])
+    assert made.parameters["body/b.mass"].value == 2.0
+    assert made.compiled.body_inertia[1] == pytest.approx(mujoco.MjModel.from_xml_string(text).body_inertia[1])
+
+
 @pytest.mark.parametrize(
     "option", [{"horizon": 0.5}, {"with_suggestions": True}, {"method": dr.LoDiransac(substeps=9)}]
 )
@@ -510,6 +539,32 @@ def test_an_inertia_that_is_impossible_by_its_errors_is_the_nearest_possible_one
     assert np.abs(found - [1.0, 1.0, 2.05]).max() < 0.1
     with pytest.raises(ModelError, match="impossible inertia"):
         calibrated_text(path, model, estimates, 1e-6 * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("drive", "fields"),
+    [
+        ('motor gear="3"', ["gainprm[0]", "gear[0]"]),
+        ('position kp="30" kv="4" timeconst="0.05"', ["kp", "dynprm[0]", "kv"]),
+        ('position kp="30" dampratio="1" forcerange="-2 2" inheritrange="0.5"', ["kp"]),
+        ('velocity kv="4"', ["kv"]),
+        ('muscle range="0.6 1.2" force="40" lengthrange="0 1" ctrlrange="0 1"', ["dynprm[1]", "gainprm[2]"]),
+    ],
+)
+def test_a_description_with_estimates_has_these_in_drives_of_any_kind(
+    tmp_path: Path, drive: str, fields: list[str]
+) -> None:
+    path = tmp_path / "carts.xml"
+    path.write_text(carts(1.5, damping=1.0, drive=drive).replace('type="slide"', 'type="slide" range="0 1"'))
+    model = dr.models.mujoco(path, unknown=[f"actuator/*.{x}" for x in fields])
+    values = {name: 7.0 + k for k, name in enumerate(model.parameters)}
+    path.write_text(calibrated_text(path, model, values, np.eye(len(values)))[0])
+    for unknown in model.unknowns:
+        write(model.compiled, unknown.places, values[unknown.name])
+    again, expected = mujoco.MjModel.from_xml_path(str(path)), model.compiled
+    for array in ("gainprm", "biasprm", "dynprm", "gear", "ctrlrange", "forcerange", "dyntype", "gaintype", "biastype"):
+        own, other = (getattr(x, f"actuator_{array}") for x in (again, expected))
+        assert own == pytest.approx(other, rel=1e-5), array
 
 
 @pytest.mark.parametrize("inside", ['<asset><mesh file="/etc/passwd"/></asset>', '<include file="a.xml"/>'])

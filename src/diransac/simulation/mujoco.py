@@ -349,7 +349,7 @@ class _Pool:
     ) -> tuple[FloatArray, FloatArray]:
         """States after every step, and readings before it."""
         one, module = models[0], mujoco_module()
-        sizes = (one.nq, one.nv, one.nu, one.nsensordata, one.nbody, one.ngeom, one.narena)
+        sizes = (one.nq, one.nv, one.na, one.nu, one.nsensordata, one.nbody, one.ngeom, one.narena)
         if self._data is None or self._data[0] != sizes:
             self._data = sizes, [module.MjData(one) for _ in range(max(1, self._threads))]
         n, n_steps = control.shape[:2]

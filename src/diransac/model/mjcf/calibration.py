@@ -13,14 +13,20 @@ from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.mjcf.masks import FIELDS, Place
 from diransac.model.mjcf.model import write
-from diransac.model.robots.calibration import Document, numbers
+from diransac.model.robots.calibration import Document, Element, attributes, numbers
 from diransac.model.robots.consistency import consistent_parameters
+from diransac.model.robots.description import mujoco_module
 from diransac.model.robots.sizes import check_description
 
 if TYPE_CHECKING:
     from diransac.model.mjcf.masks import Unknown
     from diransac.model.mjcf.model import MujocoModel
 
+_COMMON = (
+    "name", "class", "group", "cranklength", "joint", "jointinparent", "tendon", "slidersite", "cranksite", "site",
+    "refsite", "body", "lengthrange", "actdim", "actearly", "nsample", "interp", "delay",
+)  # fmt: skip
+"""Attributes that actuators of all kinds have, but for limits."""
 _FAR, _FIXED = 3.0, 1e-3
 """Change to a possible inertia that errors explain, standard errors; change of a given one, of its size."""
 
@@ -90,9 +96,37 @@ def _set(document: Document, compiled: Any, unknown: Unknown, kind: str, name: s
         return
     (array, first, factor), size = FIELDS[kind][field].arrays[0], FIELDS[kind][field].size
     index = getattr(compiled, kind)(name).id
+    if kind == "actuator" and not _takes(document, element, field):
+        document.changes.pop((element.begin, element.inside), None)
+        document.changes[element.begin, element.end] = _general(compiled.actuator(name), element)
+        return
     own = next(x for x in unknown.places if x.array == array and _belongs(compiled, kind, x.array, x.index[0], index))
     row = np.atleast_1d(getattr(compiled, array)[own.index[0]])[first : first + size] / factor
     document.rewrite(element, {field: numbers(row)})
+
+
+def _takes(document: Document, element: Element, field: str) -> bool:
+    """True if an actuator has a field as an attribute, on which nothing else depends."""
+    if document.changes.get((element.begin, element.end), element.tag).startswith("<general"):
+        return False
+    if field in ("kp", "kv"):
+        return element.tag == "position" and b"dampratio" not in document.source
+    return field == "gear" or element.tag == "general"
+
+
+def _general(actuator: Any, element: Element) -> str:
+    """Element of an actuator of any kind with all that MuJoCo has made of it."""
+    mujoco = mujoco_module()
+    texts = {key: text for key, text in element.attributes.items() if key in _COMMON}
+    texts["gear"] = numbers(actuator.gear)
+    for key, enum in (("dyn", mujoco.mjtDyn), ("gain", mujoco.mjtGain), ("bias", mujoco.mjtBias)):
+        kind = enum(int(np.ravel(getattr(actuator, f"{key}type"))[0])).name
+        texts |= {f"{key}type": kind.rpartition("_")[2].lower(), f"{key}prm": numbers(getattr(actuator, f"{key}prm"))}
+    for key in ("ctrl", "force", "act"):
+        limited = bool(np.ravel(getattr(actuator, f"{key}limited"))[0])
+        texts |= {f"{key}limited": str(limited).lower()}
+        texts |= {f"{key}range": numbers(getattr(actuator, f"{key}range"))} if limited else {}
+    return f"<general {attributes(texts)}/>"
 
 
 def _belongs(compiled: Any, kind: str, array: str, row: int, index: int) -> bool:

@@ -69,23 +69,25 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     Raises
     ------
     ModelError
-        The file cannot be read, or has what is not simulated here: plugins, soft bodies, actuators with states; or
-        the drives are none that MuJoCo has.
+        The file cannot be read, or has what is not simulated here: plugins, soft bodies, delays; or the drives are none
+        that MuJoCo has.
     """
     label, spec = f'robot description "{path}"', parsed(path)
     for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
         if len(list(elements)):
             raise ModelError(f"{label} has {what}, which are not simulated here; leave them out")
     spec.compiler.discardvisual, spec.compiler.fusestatic = True, False
+    if spec.compiler.inertiafromgeom == mujoco_module().mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        _forget_inertias(spec)  # visual shapes have a part in those that MuJoCo infers
     for element in (*spec.skins, *spec.lights, *spec.cameras):
         spec.delete(element)
     drives = None if actuation is None else _with_drives(label, spec, actuation)
     home = compiled_of(label, spec)
-    pose = home.key_qpos[0].copy() if home.nkey else None
+    pose = {"qpos": home.key_qpos[0].copy(), "act": home.key_act[0].copy()} if home.nkey else {}
     for element in list(spec.keys):
         spec.delete(element)
-    if pose is not None:
-        spec.add_key(name="home", qpos=pose)
+    if pose:
+        spec.add_key(name="home", **pose)
     compiled = compiled_of(label, spec)
     _check_state(label, compiled)
     for mesh in list(spec.meshes):
@@ -104,16 +106,21 @@ def compiled_of(label: str, source: Any) -> Any:
         raise ModelError(f"{label} cannot be compiled: {' '.join(str(error).split()):.300}") from error
 
 
+def _forget_inertias(spec: Any) -> None:
+    """Have MuJoCo infer the inertia of each body from its shapes before it discards those that are only looked at."""
+    for body in spec.bodies:
+        body.ipos, body.explicitinertial = [np.nan] * 3, False
+    spec.compiler.inertiafromgeom = mujoco_module().mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+
+
 def _check_state(label: str, compiled: Any) -> None:
-    """Raise ModelError where the state is more than positions and velocities."""
+    """Raise ModelError where the state is more than positions, velocities and activations."""
     mujoco = mujoco_module()
-    if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + compiled.nq + compiled.nv:
-        names = [
-            compiled.actuator(k).name for k in range(len(compiled.actuator_dyntype)) if compiled.actuator_dyntype[k]
-        ]
+    n_x = compiled.nq + compiled.nv + compiled.na
+    if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + n_x:
         raise ModelError(
-            f"{label} has states besides positions and velocities ({', '.join(names) or 'delays or plugins'}): give "
-            "actuators without dynamics, or actuation="
+            f"{label} has states besides positions, velocities and activations (of delays or plugins): leave these "
+            "out, or give actuation="
         )
     if not compiled.nv:
         raise ModelError(f"{label} has no joint: nothing in it moves")
@@ -144,7 +151,7 @@ def _with_drives(label: str, spec: Any, actuation: Actuation) -> dict[str, str]:
         if element in list(spec.actuators) or element.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR:
             spec.delete(element)
     for key in spec.keys:
-        key.ctrl = []
+        key.ctrl, key.act = [], []
     turn_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     moved = [x for x in spec.joints if x.type in turn_or_slide and (not driven or x.name in driven)]
     if not moved:
@@ -191,6 +198,16 @@ def file_drives(compiled: Any, taken: Collection[str]) -> dict[str, str]:
         name = f"{name}_ctrl" if name in taken else name
         inputs |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
     return inputs
+
+
+def activations(compiled: Any, taken: Collection[str]) -> dict[str, str]:
+    """States of actuators that have dynamics, ``<name>_activation``, with units."""
+    states = dict[str, str]()
+    for k in np.flatnonzero(compiled.actuator_actnum):
+        name, n = identifier(compiled.actuator(k).name or f"actuator_{k}"), int(compiled.actuator_actnum[k])
+        name = f"{name}_state" if f"{name}_activation" in taken else f"{name}_activation"
+        states |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
+    return states
 
 
 # ---------------------------------------------------------------------- names

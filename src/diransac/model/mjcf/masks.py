@@ -73,6 +73,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "actuator": {
         "gainprm": _own("actuator_gainprm", "1", size=10),
         "biasprm": _own("actuator_biasprm", "1", size=10),
+        "dynprm": _own("actuator_dynprm", "1", "non-negative", size=10),
         "gear": _own("actuator_gear", "1", size=6),
         "kp": Field((("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)), "N m/rad", "non-negative"),
         "kv": Field((("actuator_biasprm", 2, -1.0),), "N m s/rad", "non-negative"),

@@ -11,7 +11,14 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
-from diransac.model.mjcf.description import compiled_of, compiled_text, file_drives, joint_columns, sensor_columns
+from diransac.model.mjcf.description import (
+    activations,
+    compiled_of,
+    compiled_text,
+    file_drives,
+    joint_columns,
+    sensor_columns,
+)
 from diransac.model.mjcf.masks import ARRAYS, Place, Unknown, unknowns_of
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
@@ -44,8 +51,8 @@ def mujoco(
         parameter per mask: all that it matches have one value; with ``each:`` before it, one per match. Without index,
         one per entry of the field. Fields are those of MuJoCo's compiled model: ``body/trunk.mass``,
         ``body/payload.ipos[0]``, ``geom/*_foot.friction[0]``, ``joint/*.armature``, ``joint/*.damping``,
-        ``joint/*.frictionloss``, ``actuator/*.gainprm[0]``, ``pair/...``; also ``actuator/*.kp`` and ``.kv`` of
-        position servos, and ``sensor/*.bias``. Nominal values are the file's.
+        ``joint/*.frictionloss``, ``actuator/*.gainprm[0]``, ``actuator/*.dynprm[0]``, ``pair/...``; also
+        ``actuator/*.kp`` and ``.kv`` of position servos, and ``sensor/*.bias``. Nominal values are the file's.
     actuation : Actuation, optional
         Drives of hinges and slides in place of the file's actuators, of those joints that the file drives, or all:
         `PositionControl`, `JointTorques` or `MotorCurrents`. None: the file's actuators, whose controls are the inputs.
@@ -57,7 +64,8 @@ def mujoco(
     MujocoModel
         Hinges and slides have the columns ``knee`` and ``knee_dot``; a free joint ``base`` has ``base_x``, ...,
         ``base_qw``, ... (position and attitude in the world), ``base_vx``, ... (velocity in the world) and
-        ``base_wx``, ... (angular velocity in its frame); sensors have their own names, with ``_x``, ``_y``, ``_z``.
+        ``base_wx``, ... (angular velocity in its frame); an actuator with dynamics has the state ``<name>_activation``,
+        which need not be measured; sensors have their own names, with ``_x``, ``_y``, ``_z``.
 
     Raises
     ------
@@ -122,8 +130,10 @@ class MujocoModel(Model):
         parameters = {x.name: x.parameter for x in self.unknowns}
         taken = {n: unit for n, unit in readings.items() if n not in inputs}
         self.kinematics = None if derived else self._rates_of_coordinates  # type: ignore[assignment]
-        self._name_signals(name, coordinates, inputs, parameters, None if derived else velocities, {}, "", taken)
-        names = [n for x in joints for n in x.accelerations]
+        first_order = activations(compiled, (*coordinates, *velocities, *inputs))
+        groups = (coordinates, inputs, parameters, None if derived else velocities, first_order)
+        self._name_signals(name, *groups, "", taken)
+        names = [*(n for x in joints for n in x.accelerations), *(f"{n}_dot" for n in first_order)]
         self.accelerations = dict(zip(names, self.accelerations.values(), strict=True))
 
     # ------------------------------------------------------------------ what the simulator reads
@@ -175,8 +185,10 @@ class MujocoModel(Model):
     def home(self) -> FloatArray:
         """State ``(n_x,)`` of the file's first keyframe, or of its reference pose; at rest."""
         compiled = self.compiled
-        pose = compiled.key_qpos[0] if compiled.nkey else compiled.qpos0
-        return np.concatenate([pose, np.zeros(compiled.nv)])
+        pose, activation = compiled.qpos0, np.zeros(compiled.na)
+        if compiled.nkey:
+            pose, activation = compiled.key_qpos[0], compiled.key_act[0]
+        return np.concatenate([pose, np.zeros(compiled.nv), activation])
 
     def _rates_of_coordinates(self, q: FloatArray, v: FloatArray) -> FloatArray:
         """Derivatives of the coordinates ``(n_q, n)`` at some states, by MuJoCo's integration of positions."""
@@ -184,8 +196,8 @@ class MujocoModel(Model):
         rates = np.empty((self.n_q, np.asarray(q).shape[1]))
         for k, (own, speed) in enumerate(zip(np.asarray(q, float).T, np.asarray(v, float).T, strict=True)):
             after, before = own.copy(), own.copy()
-            module.mj_integratePos(self.compiled, after, speed, step)
-            module.mj_integratePos(self.compiled, before, speed, -step)
+            module.mj_integratePos(self.compiled, after, speed[: self.compiled.nv], step)
+            module.mj_integratePos(self.compiled, before, speed[: self.compiled.nv], -step)
             rates[:, k] = (after - before) / (2.0 * step)
         return rates
 
@@ -250,7 +262,7 @@ class MujocoModel(Model):
 
     def equations_text(self) -> tuple[str, ...]:
         """Lines in place of equations in a report."""
-        return (f"simulated by MuJoCo: {self.compiled.nbody - 1} bodies, {self.n_v} degrees of freedom",)
+        return (f"simulated by MuJoCo: {self.compiled.nbody - 1} bodies, {self.compiled.nv} degrees of freedom",)
 
     # ------------------------------------------------------------------ other models of the same machine
 

@@ -201,7 +201,7 @@ class Document:
         elif dynamics := [x for x in element.children if x.tag == "dynamics"]:
             self.rewrite(dynamics[0], texts)
         elif texts:
-            self.insert(element, f"<dynamics {_attributes(texts)}/>")
+            self.insert(element, f"<dynamics {attributes(texts)}/>")
 
     def set_body(self, name: str, inertial: FloatArray) -> None:
         """Give a body these inertial parameters about the origin of its frame."""
@@ -283,7 +283,8 @@ def _below(element: Element) -> Iterator[Element]:
         yield from _below(child)
 
 
-def _attributes(texts: Mapping[str, str]) -> str:
+def attributes(texts: Mapping[str, str]) -> str:
+    """Attributes of an element."""
     return " ".join(f"{key}={quoteattr(text)}" for key, text in texts.items())
 
 
@@ -302,5 +303,5 @@ def _urdf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
     entries = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), inertia.tolist(), strict=True)
     return (
         f'<inertial><origin xyz="{numbers(centre)}" rpy="0 0 0"/><mass value="{mass!r}"/>'
-        f"<inertia {_attributes({key: repr(x) for key, x in entries})}/></inertial>"
+        f"<inertia {attributes({key: repr(x) for key, x in entries})}/></inertial>"
     )
