@@ -90,6 +90,7 @@ def gauss_newton_step(at: JointEquations, damping: float) -> Step:
             if not more < _CORRECTED * excess:
                 break
             right, excess = at.corrected(there, trial, step), more
+            del step, trial  # the next ones take as much memory
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return Step(intervals, fit, at, step, damping, damping, 0.0)
 

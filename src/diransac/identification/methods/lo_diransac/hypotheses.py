@@ -24,7 +24,7 @@ from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
-from diransac.simulation import Measurements, RolloutBatch, rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
@@ -425,7 +425,7 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
         own, np.tile(motion.signals[starts, :n_x], (n, 1)), intervals.inputs, intervals.dt, np.tile(starts, n),
         intervals.length, intervals.first_of_log,
     )  # fmt: skip
-    compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
+    compared = intervals.measurements(columns=slice(None) if seen.all() else np.flatnonzero(seen))
     simulator = rollouts(intervals.model, names, substeps=intervals.substeps, hold=intervals.hold)
     errors = simulator.errors(batch, compared).reshape(n, -1, len(names))
     known = intervals.known[intervals.rows_of(chosen)][:, seen]

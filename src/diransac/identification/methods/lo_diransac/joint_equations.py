@@ -285,8 +285,8 @@ class JointEquations:
     of_fit : NormalEquations
         Of the fit alone.
     kinds : tuple of ErrorKind
-    rates : (N, n_s) array
-        Change of each signal per sample.
+    rates : (N, n_s) or (1, n_s) array
+        Change of each signal per sample; 0 where no error is one of signals.
     of_z, of_s, jumps : (W, k, E), (n_s, E) and (W - 1, n_x, E) array
         Derivatives with respect to the errors of the gradient of the fit, and of the jumps.
     information : (E, E) array
@@ -336,7 +336,7 @@ class JointEquations:
             fit=scores.fit,
             of_fit=at,
             kinds=tuple(kinds),
-            rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros_like(intervals.measured),
+            rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros((1, intervals.measured.shape[1])),
             of_z=stacked([x.of_z for x in slopes], at.right_z),
             of_s=stacked([x.of_s for x in slopes], at.right_s),
             jumps=stacked([x.jumps for x in slopes], at.jumps),

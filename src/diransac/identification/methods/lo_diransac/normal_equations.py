@@ -220,9 +220,12 @@ def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingI
     -------
     ShootingIntervals, Fit
     """
+    if parts == 1:
+        return intervals, fit
     finer, n_x = intervals.split(parts), fit.x.shape[1]
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    x = series[:, :: finer.length, :n_x].reshape(-1, n_x)
+    x = series[:, :: finer.length, :n_x].reshape(-1, n_x).copy()  # a view would keep all rows
+    del series
     # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
     slow = parts * (1.0 + fit.rho)
     rho = (slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho)
@@ -483,4 +486,6 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     -------
     (N, n_signals) array
     """
-    return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
+    found = fit.noise.inlying(fit.residuals, intervals.known)
+    found /= np.square(fit.noise.sigma)
+    return found
