@@ -189,11 +189,11 @@ class Arrowhead:
     def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
         """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides."""
         W, k, m = self.border.shape
-        more, border = damping + self.ridge, np.ascontiguousarray(self.border)
+        more = damping + self.ridge
         shift = more * _size(np.einsum("wii->wi", self.diagonal))
-        solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (border, right_z), shift)
+        solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (self.border, right_z), shift)
         flat = solved.reshape(W * k, -1)
-        p, var_p, of_shared = _solve_shared(self.corner, border.reshape(W * k, m).T @ flat, right_p, more)
+        p, var_p, of_shared = _solve_shared(self.corner, self.border.reshape(W * k, m).T @ flat, right_p, more)
         z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(W, k, -1)
         return Factored(z, p, inverse, below, var_p, solved[:, :, :m], log_det + of_shared)
 

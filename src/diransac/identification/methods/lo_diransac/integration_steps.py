@@ -47,7 +47,7 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
         The fit is at its optimum with these steps; only simulated again with `most` of them.
     """
     finest = replace(intervals, substeps=most)
-    accurate = with_residuals(finest, fit)
+    accurate = fit if intervals.substeps == most else with_residuals(finest, fit)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     for n in _FEW:
         if n >= most:

@@ -272,6 +272,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
         The time limit was reached.
     """
     damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
+    del fit
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
@@ -317,6 +318,7 @@ def refine_exact(
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
     at, behind = linearized(intervals, fit), list[float]()
+    del fit
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1

@@ -119,8 +119,8 @@ class ShootingIntervals:
         """
         sizes = [len(log[2]) for log in logs]
         missing = [-n % length for n in sizes]
-        measured = np.concatenate([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
-        recorded = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
+        measured = _joined([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
+        recorded = _joined([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
         sampled = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
         gaps = np.concatenate([np.pad(log[3], (0, n)) for log, n in zip(logs, missing, strict=True)])
         is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])
@@ -155,7 +155,7 @@ class ShootingIntervals:
     @cached_property
     def known(self) -> BoolArray:
         """Samples ``(N, n_s)`` that are measured, and reached by a simulation."""
-        return self.sampled & self._reached[:, None]
+        return self.sampled if self._reached.all() else self.sampled & self._reached[:, None]
 
     @cached_property
     def counted(self) -> BoolArray:
@@ -170,6 +170,8 @@ class ShootingIntervals:
     @cached_property
     def log_of_row(self) -> IntArray:
         """Log of each row ``(N,)``."""
+        if self.layout.n_logs == 1:
+            return np.broadcast_to(self.log_of[:1], len(self.is_logged))
         return np.repeat(self.log_of, self.length)
 
     @cached_property
@@ -213,7 +215,7 @@ class ShootingIntervals:
         timing = errors.input_delay, errors.input_lag, errors.gain_drift
         n_rows = [int(self.is_logged[rows].sum()) for rows in self.rows_of_logs]
         logs = zip(self.rows_of_logs, n_rows, strict=True)
-        return np.concatenate([acting_inputs(self.recorded[rows], *timing, self.hold, n) for rows, n in logs])
+        return _joined([acting_inputs(self.recorded[rows], *timing, self.hold, n) for rows, n in logs])
 
     @cached_property
     def later_inputs(self) -> FloatArray:
@@ -454,6 +456,11 @@ class ShootingIntervals:
         found = x[chosen]
         found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
         return found
+
+
+def _joined(logs: Sequence[FloatArray]) -> FloatArray:
+    """Rows of all logs; a single one is not copied."""
+    return np.concatenate(logs) if len(logs) > 1 else logs[0]
 
 
 def _stacked(directions: Sequence[FloatArray]) -> FloatArray | None:
