@@ -75,7 +75,7 @@ class CandidateTerm:
     also: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class RelativeMotion:
     """A motion of several velocities on which a term of the model depends, as a spring or damper between two bodies.
 
@@ -267,7 +267,7 @@ class _Place:
     unit: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Maker:
     """Makes the candidates of one model."""
 

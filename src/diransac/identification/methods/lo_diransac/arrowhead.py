@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _RIDGE = 1e-13
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Factored:
     """Solution of an arrowhead system, and blocks of its inverse.
 
@@ -76,7 +76,7 @@ class Factored:
         return (self.gain.reshape(W * k, m) @ self.var_p).reshape(W, k, m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arrowhead:
     """Blocks of a symmetric positive definite system.
 

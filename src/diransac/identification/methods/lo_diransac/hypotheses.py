@@ -184,7 +184,7 @@ def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: D
     return NonlinearLeastSquares().bind(replace(dataset, segments=segments))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class WeakForm:
     """Averaged rows of ``W p = b``.
 

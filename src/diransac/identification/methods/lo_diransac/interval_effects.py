@@ -20,7 +20,7 @@ _BATCHES = 4
 _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class EffectOfIntervals:
     """Change of a fit's parameters by each interval's measurements, to first order.
 

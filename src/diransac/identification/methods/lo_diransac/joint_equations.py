@@ -105,7 +105,7 @@ def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArr
     return np.asarray(slopes @ joint.step(joint.right).covariance @ slopes.T)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Slope:
     """Derivatives of the cost, and of its gradient, with respect to one error.
 
@@ -247,7 +247,7 @@ class Scores:
         return RecordingError(kind, size, float(np.sqrt(variance)) / information, gain) if gain < np.inf else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointStep:
     """Step of a fit and of errors of its recordings.
 
@@ -271,7 +271,7 @@ class JointStep:
 Right = tuple[FloatArray, FloatArray, FloatArray]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointEquations:
     """Gauss-Newton system at a fit, with errors of its recordings as further unknowns.
 

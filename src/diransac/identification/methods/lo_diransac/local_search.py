@@ -105,7 +105,7 @@ class Explanation:
         return np.asarray(np.log(np.sqrt(np.square(left).mean(axis=0)) + 1e-300))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class LocalSearch:
     """Local optimisations of one dataset.
 

@@ -63,7 +63,7 @@ _ROUNDING = 1e-12
 _HUGE, _TINY = 1e9, 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Candidates:
     """Candidate terms at a fit.
 
@@ -104,7 +104,7 @@ class Candidates:
         return CandidateTests(self.library.terms, self.units, regression.of(slice(n)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class MissingTerms:
     """Terms that the model lacks.
 
@@ -313,7 +313,7 @@ def _largest_forces(
     return np.asarray(np.sqrt(squares / intervals.counted.sum()).max(axis=1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _DrawnMotion:
     """Motions drawn from the log, signal by signal, so that nothing is correlated; their regressors (n, n_v, n_p)."""
 

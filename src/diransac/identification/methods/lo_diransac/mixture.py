@@ -28,7 +28,7 @@ _ROWS_AT_A_TIME = 4096
 _FAR = 40.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class NoiseSums:
     """Sufficient statistics of the noise of each signal; those of disjoint samples add.
 
@@ -70,7 +70,7 @@ class NoiseSums:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mixture:
     """``(1 - pi) N(0, sigma^2) + pi U(span)``: density of the residuals of each signal.
 

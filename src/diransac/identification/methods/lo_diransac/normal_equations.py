@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _FINE_RIDGE = 1e-15
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """A motion with its parameters, and the scales of every term of the cost.
 
@@ -93,7 +93,7 @@ class Fit:
         return np.where(intervals.linked[:, None], self.x[1:] - self.ends[:-1], 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class NormalEquations:
     """Gauss-Newton system at a fit.
 

@@ -62,7 +62,7 @@ _EQUATIONS = 8
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ProjectedEstimate:
     """Parameters that hold for the whole motion.
 
@@ -250,7 +250,7 @@ def with_parameters(
     return replace(found, parameters=parameters, unexplained=left)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Rows:
     """Equations on the fitted motion, ``r(p) = g + M d`` with discrepancies g and unmodelled accelerations d.
 

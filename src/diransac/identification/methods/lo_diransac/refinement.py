@@ -70,7 +70,7 @@ _LOST, _RECENT, _MORE = 2.5, 4, 10
 _UPDATES, _SETTLED = 20, 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prior:
     """Prior sizes of the discrepancies; each has the weight of one interval.
 

@@ -30,7 +30,7 @@ _WELL_CONDITIONED = 1e8
 _WORTH_THREADS = 4e6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ShootingIntervals:
     """Rows of all logs as intervals of ``length`` rows; made by `of`, which pads the last interval of each log.
 

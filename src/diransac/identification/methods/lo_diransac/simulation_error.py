@@ -217,7 +217,7 @@ def _first_states(
     return segments.estimated_states(lanes, states, spread, weights), mean, spread
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Solution:
     """Parameters with the initial states of all segments.
 

@@ -51,7 +51,7 @@ _ENOUGH = 4000
 _NUMBERS_TOGETHER = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Samples:
     """Samples of one log, in the model's order of signals.
 
@@ -73,7 +73,7 @@ class Samples:
     gaps: BoolArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """Smoothed motion.
 
@@ -259,7 +259,7 @@ def _integrate(signals: FloatArray, known: BoolArray, columns: Sequence[int], dt
         signals[:, columns[j - 1]] = integral - integral.mean()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Smoother:
     """Overlapping windows, whose polynomials are blended; their knots are ``step`` rows apart.
 

@@ -49,7 +49,7 @@ _SMALLEST, _SHARE = 1e-3, 0.2
 _ROUNDING, _SEPARATE, _TINY = 1e-12, 1e-9, 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class TermRegression:
     """Residuals of a fit as linear functions of the coefficients of K effects, all else estimated with them.
 
@@ -162,7 +162,7 @@ class TermRegression:
         return -float((own * self.residuals).sum() / (np.square(own).sum() + _TINY))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class TermSet:
     """A term that the model may lack, or two together.
 
@@ -183,7 +183,7 @@ class TermSet:
     covariance: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class CandidateTests:
     """Tests of K candidates at a fit.
 

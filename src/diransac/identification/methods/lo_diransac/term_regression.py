@@ -114,7 +114,7 @@ def term_regression(
     return TermRegression(effects, direct, left, columns, force, moved[:, :, :-1], acts, slopes, batch)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Pushed:
     """A fit that accelerations (W, n_v, K) of K terms push, and its normal equations."""
 
