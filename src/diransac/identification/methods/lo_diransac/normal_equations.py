@@ -220,16 +220,15 @@ def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingI
     -------
     ShootingIntervals, Fit
     """
+    # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
+    slow = parts * (1.0 + fit.rho)
+    fit = replace(fit, rho=(slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho))
     if parts == 1:
         return intervals, fit
     finer, n_x = intervals.split(parts), fit.x.shape[1]
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
     x = series[:, :: finer.length, :n_x].reshape(-1, n_x).copy()  # a view would keep all rows
-    del series
-    # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
-    slow = parts * (1.0 + fit.rho)
-    rho = (slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho)
-    return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
+    return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0)))
 
 
 def linearize(

@@ -446,8 +446,8 @@ def _basis(t: FloatArray, unit: float) -> FloatArray:
 
 
 def _blocks(shape: tuple[int, ...]) -> list[slice]:
-    """Windows ``(K, ...)`` in blocks of a few numbers."""
-    n = -(-int(np.prod(shape)) // _NUMBERS_TOGETHER)
+    """Windows ``(K, ...)`` in blocks, of three signals some 60,000 rows each."""
+    n = -(-int(np.prod(shape)) // (8 * _NUMBERS_TOGETHER))
     edges = np.linspace(0, shape[0], n + 1).astype(int).tolist()
     return [slice(a, b) for a, b in pairwise(edges) if a < b]
 
