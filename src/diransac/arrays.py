@@ -15,9 +15,9 @@ MAD_TO_STD = 1.4826
 _ROWS_AT_A_TIME = 65_536
 
 
-def row_blocks(n_rows: int) -> Iterator[slice]:
+def row_blocks(n_rows: int, at_a_time: int = _ROWS_AT_A_TIME) -> Iterator[slice]:
     """Blocks of rows in which long arrays are visited, in order, so that intermediate results take little memory."""
-    return (slice(k, k + _ROWS_AT_A_TIME) for k in range(0, max(n_rows, 1), _ROWS_AT_A_TIME))
+    return (slice(k, k + at_a_time) for k in range(0, max(n_rows, 1), at_a_time))
 
 
 def robust_std(deviations: FloatArray, axis: int | None = None) -> FloatArray:

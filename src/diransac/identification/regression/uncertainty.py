@@ -219,7 +219,7 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
 
 @cache
 def _quadrature() -> tuple[FloatArray, FloatArray]:
-    """Points and weights of Gauss-Legendre quadrature on [-1, 1], as of `numpy.polynomial`, whose import takes 19 ms."""
+    """Points and weights of Gauss-Legendre quadrature on [-1, 1]; the import of `numpy.polynomial` takes 19 ms."""
     n = 100
     k = np.arange(n)
     scale = 1.0 / np.sqrt(2 * k + 1)

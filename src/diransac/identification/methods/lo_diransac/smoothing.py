@@ -88,7 +88,7 @@ class Motion:
     signals: FloatArray
     spread: FloatArray
 
-    def parts(self, model: Model, rows: BoolArray | IntArray) -> list[FloatArray]:
+    def parts(self, model: Model, rows: BoolArray | IntArray | slice) -> list[FloatArray]:
         """Coordinates, velocities, accelerations and sensors in some rows."""
         return split_signals(model, self.signals[rows])
 
