@@ -16,15 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, row_blocks
 from diransac.data.checks import rows_per_sample
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.simulation.compiler import compile_map
@@ -289,11 +288,11 @@ class _Smoother:
         A mask ``(N, C)`` is that of the rows in a window with more samples than its polynomial has coefficients.
         """
         (N, C, c), n, n_t = values.shape, values.shape[2] + derivatives, len(self.blend)
-        some, oks, about = self._windows(values), self._windows(known, mode="constant"), self._windows(centre)
+        some, oks, about = self._windows(values), self._windows(known), self._windows(centre)
         coefficients = _coefficients(some, oks, about, self.basis[:c], _spread(centre))
         log, of_rows = slice(n_t // 2, n_t // 2 + N), np.zeros((C, 1 + n, (oks.shape[1] + 1) * self.step + n_t))
         for i, (own, ok) in enumerate(zip(coefficients, oks, strict=True)):
-            for knots in _blocks(ok.shape):
+            for knots in row_blocks(len(ok), max(1, 8 * _NUMBERS_TOGETHER // ok[0].size)):
                 fitted = np.einsum("ka,jta->ktj", own[knots], self.basis[:n])
                 enough = ok[knots].any(axis=2).sum(axis=1) > _DEGREE + 1
                 weight = self.blend * np.where(enough, 1.0, _UNINFORMED)[:, None]
@@ -304,10 +303,11 @@ class _Smoother:
         of_rows[:, 1:] /= of_rows[:, :1]
         return np.moveaxis(of_rows[:, 1:], 2, 0), (of_rows[:, 0] > _UNINFORMED * n_t).T
 
-    def _windows(self, values: NDArray[Scalar], mode: Literal["edge", "constant"] = "edge") -> NDArray[Scalar]:
-        """Views ``(C, K, n_t, c)`` of chains ``(N, C, c)`` about every knot, padded beyond the ends of the log."""
+    def _windows(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Views ``(C, K, n_t, c)`` of chains ``(N, C, c)`` about every knot; no sample is known beyond the log."""
         half = len(self.blend) // 2
-        rows = np.pad(np.moveaxis(values, 1, 0), ((0, 0), (half, half), (0, 0)), mode=mode)
+        wide = (0, 0), (half, half), (0, 0)
+        rows = np.pad(np.moveaxis(values, 1, 0), wide, mode="constant" if values.dtype == bool else "edge")
         return np.moveaxis(sliding_window_view(rows, len(self.blend), axis=1)[:, :: self.step], 3, 2)
 
     def _add(self, rows: FloatArray, windows: FloatArray) -> None:
@@ -365,23 +365,23 @@ def _prediction_errors(
     halves: IntArray,
     usual: IntArray,
     apart: IntArray,
-    spreads: FloatArray,
+    sizes: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Robust scale of the left-out samples over a signal's spread: of each signal, and of the first of each chain."""
     measured, known, centre = (
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
-    sizes, found, first_of_chains = [len(log.measured) for log in logs], list[FloatArray](), list[float]()
+    found, first_of_chains = list[FloatArray](), list[float]()
     for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
         k = columns[0, 0]
         stride = max(1, half // usual[k]) if apart[k] == 1 else 1
         offsets = np.arange(-half, half + 1, stride)
-        rows = _trial_rows(sizes, _TRIALS * max(1, usual[k] // half), half, offsets)
+        rows = _trial_rows([len(log.measured) for log in logs], _TRIALS * max(1, usual[k] // half), half, offsets)
         near = np.abs(offsets) <= half // 2
         basis = _basis(offsets / half, half * dt)
         values, oks, about = (np.moveaxis(x[:, columns][rows], 2, 0) for x in (measured, known, centre))
-        spread, even, orders = spreads[columns], _every_other(oks), basis[: columns.shape[1]]
+        spread, even, orders = sizes[columns], _every_other(oks), basis[: columns.shape[1]]
         coefficients = _coefficients(values, oks & even, about, orders, spread)
         fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
         tested, n = oks & near[:, None] & ~even, oks.shape[1] * oks.shape[2]
@@ -445,13 +445,6 @@ def _basis(t: FloatArray, unit: float) -> FloatArray:
     return np.stack(orders)
 
 
-def _blocks(shape: tuple[int, ...]) -> list[slice]:
-    """Windows ``(K, ...)`` in blocks, of three signals some 60,000 rows each."""
-    n = -(-int(np.prod(shape)) // (8 * _NUMBERS_TOGETHER))
-    edges = np.linspace(0, shape[0], n + 1).astype(int).tolist()
-    return [slice(a, b) for a, b in pairwise(edges) if a < b]
-
-
 def _coefficients(
     values: FloatArray, known: BoolArray, centre: FloatArray, basis: FloatArray, spread: FloatArray
 ) -> FloatArray:
@@ -460,7 +453,8 @@ def _coefficients(
     floor = _FLOOR * spread + 1e-12
     products = np.einsum("jta,jtb->tjab", basis, basis).reshape(n_t * c, -1)
     flat = basis.swapaxes(0, 1).reshape(n_t * c, -1)
-    blocks, found = _blocks((K, C, n_t, c)), np.empty((C, K, _DEGREE + 1))
+    found = np.empty((C, K, _DEGREE + 1))
+    blocks = list(row_blocks(K, max(1, 8 * _NUMBERS_TOGETHER // (C * n_t * c))))  # of three signals, some 60,000 rows
     seen = _sampled((known[:, k] for k in blocks), K * n_t)
 
     def left(of: slice, step: int) -> FloatArray:
