@@ -428,7 +428,7 @@ class ShootingIntervals:
             weights[rows, columns],
             unknowns=unknowns,
             normal_matrix=normal_matrix,
-            directions=_stacked([x[rows, columns] for x in directions]),
+            directions=np.stack([x[rows, columns] for x in directions], axis=1) if directions else None,
             threads=threads,
         )
 
@@ -461,13 +461,6 @@ class ShootingIntervals:
 def _joined(logs: Sequence[FloatArray]) -> FloatArray:
     """Rows of all logs; a single one is not copied."""
     return np.concatenate(logs) if len(logs) > 1 else logs[0]
-
-
-def _stacked(directions: Sequence[FloatArray]) -> FloatArray | None:
-    """Directions (N, n, n_s); a single one is not copied."""
-    if len(directions) > 1:
-        return np.stack(directions, axis=1)
-    return directions[0][:, None] if directions else None
 
 
 def _differences(values: FloatArray) -> FloatArray:
