@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
@@ -305,8 +306,7 @@ class _Smoother:
 
     def _windows(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Views ``(C, K, n_t, c)`` of chains ``(N, C, c)`` about every knot; no sample is known beyond the log."""
-        half = len(self.blend) // 2
-        wide = (0, 0), (half, half), (0, 0)
+        wide = (0, 0), (len(self.blend) // 2,) * 2, (0, 0)
         rows = np.pad(np.moveaxis(values, 1, 0), wide, mode="constant" if values.dtype == bool else "edge")
         return np.moveaxis(sliding_window_view(rows, len(self.blend), axis=1)[:, :: self.step], 3, 2)
 
@@ -421,13 +421,13 @@ def _trial_rows(sizes: Sequence[int], trials: int, half: int, offsets: IntArray)
 
 def _spread(values: FloatArray) -> FloatArray:
     """Standard deviation of each column by the MAD; by the central 80 % where half the samples have one value."""
-    found = np.empty(values.shape[1:])
-    for k in np.ndindex(found.shape):
-        own = values[:, *k]
+
+    def of_one(own: FloatArray) -> float:
         low, median, high = np.quantile(own, [0.1, 0.5, 0.9])
-        mad, wide = robust_std(own - median), (high - low) / 2.563
-        found[k] = mad if mad > _AT_REST * wide else wide
-    return found
+        mad, wide = float(robust_std(own - median)), float(high - low) / 2.563
+        return mad if mad > _AT_REST * wide else wide
+
+    return np.apply_along_axis(of_one, 0, values)
 
 
 def _spread_of_known(values: FloatArray) -> FloatArray:
@@ -457,17 +457,19 @@ def _coefficients(
     blocks = list(row_blocks(K, max(1, 8 * _NUMBERS_TOGETHER // (C * n_t * c))))  # of three signals, some 60,000 rows
     seen = _sampled((known[:, k] for k in blocks), K * n_t)
 
-    def left(of: slice, step: int) -> FloatArray:
-        """Residuals ``(C, K, n_t, c)`` before a step, of the last one's polynomials, or of the centre."""
+    @lru_cache(maxsize=1)
+    def left(i: int, step: int) -> FloatArray:
+        """Residuals ``(C, K, n_t, c)`` of a block before a step: of the last one's polynomials, or of the centre."""
+        of = blocks[i]
         fitted = (found[:, of].reshape(-1, _DEGREE + 1) @ flat.T).reshape(C, -1, n_t, c) if step else centre[:, of]
         return np.asarray(values[:, of] - fitted)
 
     scale = np.zeros((C, c))
     for step in range(_STEPS):
-        own = _scale(_sampled((left(k, step) for k in blocks), K * n_t), seen)
+        own = _scale(_sampled((left(i, step) for i in range(len(blocks))), K * n_t), seen)
         scale = np.maximum(np.maximum(own, floor), _SHRINK * scale)
-        for k in blocks:
-            weights = left(k, step).reshape(C, -1, n_t * c)
+        for i, k in enumerate(blocks):
+            weights = left(i, step).reshape(C, -1, n_t * c)
             weights *= np.tile(1.0 / (3.0 * scale), n_t)[:, None]
             weights *= weights
             weights += 1.0

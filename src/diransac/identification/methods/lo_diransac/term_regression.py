@@ -8,9 +8,9 @@ memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
@@ -128,16 +128,17 @@ class _Pushed:
         """Largest number of measurements of an interval."""
         return int(self.intervals.known.reshape(len(self.intervals), -1).sum(axis=1).max())
 
-    def of_measurements(self, part: slice) -> GaussNewtonBatch:
-        """Sums of the measurements of some intervals."""
-        fit = self.fit
-        return self.intervals.gauss_newton(
-            fit.shared, fit.x, fit.d, self.at.weights, chosen=np.arange(part.start, part.stop)
-        )
+    @cached_property
+    def of_measurements(self) -> Callable[[int, int], GaussNewtonBatch]:
+        """Sums of the measurements of intervals from one to before another; the last ones are kept."""
+        at = self.fit.shared, self.fit.x, self.fit.d, self.at.weights
+        return lru_cache(maxsize=1)(lambda *some: self.intervals.gauss_newton(*at, chosen=np.arange(*some)))
 
     def by_d(self, part: slice) -> FloatArray:
         """Columns ``(n, n, n_v)`` of the unmodelled accelerations in the information of the measurements."""
-        return self.of_measurements(part).normal_matrix[:, :, self.fit.x.shape[1] : self.at.right_z.shape[1]]
+        return self.of_measurements(part.start, part.stop).normal_matrix[
+            :, :, self.fit.x.shape[1] : self.at.right_z.shape[1]
+        ]
 
     def jumps(self, links: slice) -> tuple[FloatArray, FloatArray]:
         """Change ``(n, n_x, K)`` of the jumps at the ends of some intervals, and that times their precision."""
@@ -187,7 +188,8 @@ class _Pushed:
         -------
         (n, m, K + 2) array
         """
-        at, intervals, fit, sums = self.at, self.intervals, self.fit, self.of_measurements(part)
+        at, intervals, fit = self.at, self.intervals, self.fit
+        sums = self.of_measurements(part.start, part.stop)
         n_x, k, K = fit.x.shape[1], z.shape[1], s.shape[1]
         moved, of_log = z.copy(), of_logs(intervals, s, part)
         moved[:, n_x:, :-1] += self.accelerations[part]
