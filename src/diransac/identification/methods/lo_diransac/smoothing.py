@@ -497,5 +497,4 @@ def _sampled(blocks: Iterable[NDArray[Scalar]], n: int) -> NDArray[Scalar]:
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     """Robust standard deviation ``(C, c)`` of each chain's signals; one where nothing is measured."""
-    scale = lower_scale(residuals, known)
-    return np.where(np.isnan(scale), 1.0, scale)
+    return np.nan_to_num(lower_scale(residuals, known), nan=1.0, posinf=np.inf)
