@@ -131,8 +131,9 @@ class _Pushed:
     @cached_property
     def of_measurements(self) -> Callable[[int, int], GaussNewtonBatch]:
         """Sums of the measurements of intervals from one to before another; the last ones are kept."""
-        at = self.fit.shared, self.fit.x, self.fit.d, self.at.weights
-        return lru_cache(maxsize=1)(lambda *some: self.intervals.gauss_newton(*at, chosen=np.arange(*some)))
+        intervals, at = self.intervals, (self.fit.shared, self.fit.x, self.fit.d, self.at.weights)
+        # Without a reference to this object, which would keep its equations until a collection of garbage.
+        return lru_cache(maxsize=1)(lambda *some: intervals.gauss_newton(*at, chosen=np.arange(*some)))
 
     def by_d(self, part: slice) -> FloatArray:
         """Columns ``(n, n, n_v)`` of the unmodelled accelerations in the information of the measurements."""
