@@ -122,6 +122,7 @@ def test_arrowhead_functionals_are_the_same_section_by_section(length):
     z, s = blocks.functional(*wanted)
     sections = [slice(k, min(k + length, 7)) for k in range(0, 7, length)]
     parts, own = blocks.functional_in_sections(lambda part: wanted[0][part], wanted[1], sections)
+    parts = list(parts)
     assert [len(x) for x in parts] == [x.stop - x.start for x in sections]
     assert np.allclose(np.concatenate(parts), z, rtol=1e-9, atol=1e-12 * np.abs(z).max())
     assert np.allclose(own, s, rtol=1e-9, atol=1e-12 * np.abs(s).max())
@@ -154,7 +155,7 @@ def test_mixture_finds_a_planted_scale_and_fraction():
     known = np.ones(hit.shape, bool)
     noise = Mixture(np.array([2.0]), np.array([0.1]), np.array([40.0]), np.array([1e-6]))
     for _ in range(40):
-        noise = noise.updated(residuals, known, noise.inlying(residuals, known))
+        noise = noise.updated(residuals, known)
     assert noise.sigma[0] == pytest.approx(0.1, rel=0.05)
     assert noise.pi[0] == pytest.approx(hit.mean(), abs=0.01)
 
@@ -445,9 +446,9 @@ def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts(late):
     assert kept < best
 
 
-@pytest.mark.parametrize(("n_failures", "begin", "damped", "following"), [(0, 1e-3, 1e-3, 1e-4), (2, 1e-5, 1e-3, 1e-3)])
+@pytest.mark.parametrize(("n_failures", "begin", "following"), [(0, 1e-3, 1e-4), (2, 1e-5, 1e-3)])
 def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_without_it(
-    n_failures, begin, damped, following, monkeypatch
+    n_failures, begin, following, monkeypatch
 ):
     intervals, signals = intervals_of(n_rows=200)
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
@@ -462,7 +463,8 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
     monkeypatch.setattr(gauss_newton, "cost", failing)
     step = gauss_newton.gauss_newton_step(at, begin)
     assert cost(step.intervals, step.fit, weights) < before
-    np.testing.assert_allclose([step.damped, step.damping], [damped, following])
+    assert step.taken is None
+    np.testing.assert_allclose(step.damping, following)
     np.testing.assert_array_equal(step.solved.var_p, at.step(at.right).of_fit.var_p)
 
 

@@ -1,5 +1,7 @@
 """The array types of every signature, whose shapes are in the docstrings; robust scale of arrays, and runs in masks."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,13 @@ IntArray = NDArray[np.int64]
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
+
+_ROWS_AT_A_TIME = 65_536
+
+
+def row_blocks(n_rows: int, at_a_time: int = _ROWS_AT_A_TIME) -> Iterator[slice]:
+    """Blocks of rows in which long arrays are visited, in order, so that intermediate results take little memory."""
+    return (slice(k, k + at_a_time) for k in range(0, max(n_rows, 1), at_a_time))
 
 
 def robust_std(deviations: FloatArray, axis: int | None = None) -> FloatArray:

@@ -118,7 +118,7 @@ INTEGRATORS = {"rk4": _rk4, "euler": _euler, "semi-implicit-euler": _semi_implic
 
 
 # Sensitivities -------------------------------------------------------------------------------------------------------
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities:
     """Structure of the derivatives of the state with respect to the unknowns; made by `sensitivities_of`.
 

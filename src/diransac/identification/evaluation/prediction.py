@@ -22,7 +22,7 @@ from diransac.identification.settings import Settings
 # ---------------------------------------------------------------------- simulations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Restarts:
     """States of a log from which its simulation starts: equidistant ones, and those after gaps.
 

@@ -21,7 +21,7 @@ from diransac.model import Model
 # ---------------------------------------------------------------------- weights and thresholds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scoring:
     """Error weights and inlier thresholds of a dataset's signals.
 

@@ -15,7 +15,7 @@ from diransac.identification.diagnosis import Resolution
 from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, Simulator, default_threads, rollouts
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scores:
     """Agreement of hypotheses with a dataset; each hypothesis is a lane.
 
@@ -107,7 +107,7 @@ def stretches_of(one: Segment, rule: str | Mapping[str, float]) -> tuple[Stretch
     return (Stretch(first, rule), *(Stretch(rows, later) for rows in others))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Run:
     """Data of the simulation of a stretch: all but its parameters.
 

@@ -107,7 +107,7 @@ class Evaluator:
         return ScoredBatch(scores, self._weights, self._valid)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Hypothesis:
     """A hypothesis and its place in a scored batch.
 
@@ -132,7 +132,7 @@ class Hypothesis:
     lane: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class FittedSamples:
     """Random samples, their parameters, and the scores of those that pass the preliminary test.
 

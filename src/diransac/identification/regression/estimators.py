@@ -33,7 +33,7 @@ MIN_EIGENVALUE = 1e-6
 _LEAST_NOISE = 1e-5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Selection:
     """Sets of rows, gathered once, to be tested and fitted.
 
@@ -203,7 +203,7 @@ class TotalLeastSquares(_SumsEstimator):
             return np.where(np.abs(last) > np.finfo(float).eps, -smallest[..., :-1] / last, np.nan)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _PriorSums:
     """Sums that priors add to those of sets of rows, in columns of unit RMS.
 

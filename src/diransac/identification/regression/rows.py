@@ -25,7 +25,7 @@ from diransac.simulation.compiler import compile_map
 _TINY = 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class MotionRows:
     """Rows of one log at which the equations are evaluated.
 
@@ -61,7 +61,7 @@ def motion_rows(dataset: Dataset) -> list[MotionRows]:
     return [MotionRows(*(x[valid] for x in arrays)) for valid, arrays in parts]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Robust least squares of all rows of logs.
 
@@ -296,7 +296,7 @@ PART_OF_NULL_VECTOR = 0.1
 """Entry from which on a parameter takes part in a null vector of a log."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class NullSpace:
     """Directions in which parameters can change without an effect on rows ``W p``.
 

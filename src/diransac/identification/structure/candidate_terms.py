@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -75,7 +75,7 @@ class CandidateTerm:
     also: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class RelativeMotion:
     """A motion of several velocities on which a term of the model depends, as a spring or damper between two bodies.
 
@@ -138,10 +138,11 @@ class CandidateTerms:
         entries, rows, columns = self._entries
         n = len(weights) // length
         found = np.zeros((n, self.terms[0].residuals.numel(), len(self)))
-        step = max(1, 4096 // length)
+        step, mapped = max(1, 4096 // length), cache(entries.map)
         for k in range(0, n, step):
             part = slice(k * length, (k + step) * length)
-            values = _in_every_row(entries, [x[part] for x in motion]) * weights[part, None]
+            own = [x[part] for x in motion]
+            values = _in_every_row(mapped(len(own[0])), own) * weights[part, None]
             found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
         return found
 
@@ -177,10 +178,10 @@ class CandidateTerms:
         )  # fmt: skip
 
 
-def _in_every_row(function: ca.Function, arrays: Sequence[FloatArray]) -> FloatArray:
+def _in_every_row(mapped: ca.Function, arrays: Sequence[FloatArray]) -> FloatArray:
     """Values (N, n) of a function of vectors over rows (N, n_i), by CasADi: these are too many terms to compile."""
-    inputs, found = [np.ascontiguousarray(x) for x in arrays], np.empty((len(arrays[0]), function.numel_out(0)))
-    buffer, evaluate = function.map(len(found)).buffer()
+    inputs, found = [np.ascontiguousarray(x) for x in arrays], np.empty(mapped.size_out(0)[::-1])
+    buffer, evaluate = mapped.buffer()
     for k, rows in enumerate(inputs):
         buffer.set_arg(k, rows.data)  # type: ignore[call-arg]  # a buffer has a size
     buffer.set_res(0, found.data)  # type: ignore[call-arg]
@@ -266,7 +267,7 @@ class _Place:
     unit: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Maker:
     """Makes the candidates of one model."""
 

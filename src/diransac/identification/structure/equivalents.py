@@ -134,7 +134,7 @@ def _response(model: Model, parameters: FloatArray, measured: Sequence[str], ran
     return response
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _SameResponse:
     """Least squares of the differences of responses; the unknowns are logarithms of factors of some parameters."""
 

@@ -63,10 +63,11 @@ def solve_blocks(
     # Part of its diagonal that a pivot is at least: what rounding leaves where a system is singular.
     coupling, pivots = np.ascontiguousarray(below, np.float64), 1e-16 * own
     inverse_below = np.zeros((n - 1, padded_k, padded_k))
-    arrays = (blocks, coupling, inverse_below, pivots)
-    _code().call(*(array.ctypes.data for array in arrays), n, k, padded_k, padded_c)
+    addresses = [array.ctypes.data for array in (blocks, coupling, inverse_below, pivots)]
+    _code().call(*addresses, n, k, padded_k, padded_c)
+    inverse_below = inverse_below[:, :k, :k].copy()
     solved, inverse = blocks[:, :, 2 * padded_k : c].copy(), blocks[:, :, :k].copy()
-    return BlockSolution(solved, inverse, inverse_below[:, :k, :k].copy(), float(np.log(pivots).sum()))
+    return BlockSolution(solved, inverse, inverse_below, float(np.log(pivots).sum()))
 
 
 @cache

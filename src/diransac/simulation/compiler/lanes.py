@@ -55,7 +55,7 @@ ARGUMENTS = {
 """Arguments of the compiled time loop, in order, and their kinds."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Lanes:
     """Parameters, initial states and inputs of rollouts.
 

@@ -46,7 +46,7 @@ _NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
 """Loss in comparison with which all are equal: a thousandth of the motion."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scores:
     """Predictions of one candidate.
 
@@ -62,7 +62,7 @@ class Scores:
     losses: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Candidates in comparison, block by block, by the logarithm of their losses: no block decides alone.
 
@@ -149,7 +149,7 @@ def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after
     return np.concatenate(starts), np.concatenate(left_out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arbiter:
     """Segments of the logs that every candidate predicts.
 

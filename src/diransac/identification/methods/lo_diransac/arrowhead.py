@@ -11,7 +11,7 @@ inverse cost O(W).  Windows are eliminated by compiled code, for the border as f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _RIDGE = 1e-13
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Factored:
     """Solution of an arrowhead system, and blocks of its inverse.
 
@@ -76,7 +76,7 @@ class Factored:
         return (self.gain.reshape(W * k, m) @ self.var_p).reshape(W, k, m)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arrowhead:
     """Blocks of a symmetric positive definite system.
 
@@ -136,11 +136,11 @@ class Arrowhead:
 
     def functional_in_sections(
         self, of_z: Callable[[slice], FloatArray], of_p: FloatArray, sections: Sequence[slice]
-    ) -> tuple[list[FloatArray], FloatArray]:
-        """Inverse times columns, as `functional`, of which no more than a section's are needed at a time.
+    ) -> tuple[Iterator[FloatArray], FloatArray]:
+        """Inverse times columns, as `functional`, of which no more than a section's are held at a time.
 
         A section is solved with what the windows before it leave of its first one when they are eliminated, and with
-        the solution of the window after it.
+        the solution of the window after it: once for the shared unknowns, and again when its own are asked for.
 
         Parameters
         ----------
@@ -152,8 +152,8 @@ class Arrowhead:
 
         Returns
         -------
-        list of (n, k, c) array
-            Of each section.
+        iterator of (n, k, c) array
+            Of each section, in their order.
         (m, c) array
         """
         m, shift = len(self.corner), self.ridge * _size(np.einsum("wii->wi", self.diagonal))
@@ -171,26 +171,29 @@ class Arrowhead:
         for part in sections[:-1]:
             found, link = solved(part, left[-1]), self.below[part.stop - 1]
             left.append((link @ found.inverse[-1] @ link.T, link @ found.solved[-1]))
-        windows, after = list[FloatArray](), None
+            del found
+        common, ends, after = np.zeros((m, m + of_p.shape[1])), list[FloatArray | None](), None
         for part, before in zip(reversed(sections), reversed(left), strict=True):
-            windows.append(solved(part, before, after).solved)
-            after = windows[-1][0]
-        windows.reverse()
-        pairs = zip(sections, windows, strict=True)
-        common = np.sum([self.border[k].reshape(-1, m).T @ x.reshape(-1, x.shape[2]) for k, x in pairs], axis=0)
+            ends.append(after)
+            last = solved(part, before, after).solved
+            common += self.border[part].reshape(-1, m).T @ last.reshape(-1, last.shape[2])
+            after = last[0].copy()
         p, _, _ = _solve_shared(self.corner, common, of_p, self.ridge)
-        for i, x in enumerate(windows):
-            windows[i] = x[:, :, m:] - (x[:, :, :m].reshape(-1, m) @ p).reshape(*x.shape[:2], -1)
-        return windows, p
+
+        def own(x: FloatArray) -> FloatArray:
+            return x[:, :, m:] - (x[:, :, :m].reshape(-1, m) @ p).reshape(*x.shape[:2], -1)
+
+        again = (solved(*x).solved for x in zip(sections, left, reversed(ends), strict=True))
+        return map(own, again if len(sections) > 1 else [last]), p
 
     def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
         """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides."""
         W, k, m = self.border.shape
-        more, border = damping + self.ridge, np.ascontiguousarray(self.border)
+        more = damping + self.ridge
         shift = more * _size(np.einsum("wii->wi", self.diagonal))
-        solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (border, right_z), shift)
+        solved, inverse, below, log_det = solve_blocks(self.diagonal, self.below, (self.border, right_z), shift)
         flat = solved.reshape(W * k, -1)
-        p, var_p, of_shared = _solve_shared(self.corner, border.reshape(W * k, m).T @ flat, right_p, more)
+        p, var_p, of_shared = _solve_shared(self.corner, self.border.reshape(W * k, m).T @ flat, right_p, more)
         z = solved[:, :, m:] - (flat[:, :m] @ p).reshape(W, k, -1)
         return Factored(z, p, inverse, below, var_p, solved[:, :, :m], log_det + of_shared)
 

@@ -30,7 +30,7 @@ class ErrorKind:
     of_inputs: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class RecordingErrors:
     """Systematic errors of the sensors and of the inputs, and what the sensors measured.
 

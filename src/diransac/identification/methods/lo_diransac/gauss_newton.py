@@ -38,9 +38,10 @@ class Step:
         After the step.
     at : JointEquations
         Before it.
-    taken : JointStep
-    damped, damping : float
-        Of this step and of the next.
+    taken : JointStep or None
+        None of a damped one.
+    damping : float
+        Of the next step.
     of_errors : float
         Largest change of an error of the recordings over its standard error.
     """
@@ -48,15 +49,14 @@ class Step:
     intervals: ShootingIntervals
     fit: Fit
     at: JointEquations
-    taken: JointStep
-    damped: float
+    taken: JointStep | None
     damping: float
     of_errors: float
 
     @cached_property
     def solved(self) -> Factored:
         """Solution without damping, which is no information: scales and standard errors follow from it."""
-        return (self.at.step(self.at.right) if self.damped else self.taken).of_fit
+        return (self.taken or self.at.step(self.at.right)).of_fit
 
 
 def gauss_newton_step(at: JointEquations, damping: float) -> Step:
@@ -86,12 +86,13 @@ def gauss_newton_step(at: JointEquations, damping: float) -> Step:
             if more <= 1e-9 * before:
                 least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
                 of_errors = float((np.abs(step.sizes) / step.std).max(initial=0.0))
-                return Step(there, trial, at, step, damping, least, of_errors)
+                return Step(there, trial, at, None if damping else step, least, of_errors)
             if not more < _CORRECTED * excess:
                 break
             right, excess = at.corrected(there, trial, step), more
+            del step, trial  # the next ones take as much memory
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return Step(intervals, fit, at, step, damping, damping, 0.0)
+    return Step(intervals, fit, at, None, damping, 0.0)
 
 
 def after_step(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:

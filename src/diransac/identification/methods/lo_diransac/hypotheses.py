@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, row_blocks
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
-from diransac.simulation import Measurements, RolloutBatch, rollouts
+from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
@@ -184,7 +184,7 @@ def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: D
     return NonlinearLeastSquares().bind(replace(dataset, segments=segments))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class WeakForm:
     """Averaged rows of ``W p = b``.
 
@@ -313,7 +313,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
     bump /= bump.sum()
     Ws, bs = [], []
     for i, rows in enumerate(intervals.rows_of_logs):
-        logged = np.arange(rows.start, rows.stop)[intervals.is_logged[rows]]
+        logged = slice(rows.start, rows.start + int(intervals.is_logged[rows].sum()))
         q, v, a, y = motion.parts(model, logged)
         W, b = regression_rows(model, q, v, a, intervals.inputs[logged], y)
         r = b.shape[1]
@@ -323,7 +323,10 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         if not len(firsts):
             continue
         both = np.concatenate([W.swapaxes(1, 2).reshape(len(b), -1), b], axis=1)
-        means = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)[firsts] @ bump
+        del q, v, a, y, W
+        windows = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)
+        at_a_time = max(1, _NUMBERS_AT_A_TIME // windows[0].size)
+        means = np.concatenate([windows[firsts[k]] @ bump for k in row_blocks(len(firsts), at_a_time)])
         Ws.append(layout.scattered(means[:, : n_p * r].reshape(-1, n_p, r).swapaxes(1, 2), i))
         bs.append(means[:, n_p * r :])
     return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
@@ -425,7 +428,7 @@ def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray
         own, np.tile(motion.signals[starts, :n_x], (n, 1)), intervals.inputs, intervals.dt, np.tile(starts, n),
         intervals.length, intervals.first_of_log,
     )  # fmt: skip
-    compared = Measurements(intervals.measured[:, seen], intervals.measurements.valid)
+    compared = intervals.measurements(columns=slice(None) if seen.all() else np.flatnonzero(seen))
     simulator = rollouts(intervals.model, names, substeps=intervals.substeps, hold=intervals.hold)
     errors = simulator.errors(batch, compared).reshape(n, -1, len(names))
     known = intervals.known[intervals.rows_of(chosen)][:, seen]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diransac.arrays import row_blocks
 from diransac.identification.methods.lo_diransac.gauss_newton import after_step
 from diransac.identification.methods.lo_diransac.normal_equations import (
     linearize,
@@ -46,30 +47,33 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
         The fit is at its optimum with these steps; only simulated again with `most` of them.
     """
     finest = replace(intervals, substeps=most)
-    accurate = with_residuals(finest, fit)
+    accurate = fit if intervals.substeps == most else with_residuals(finest, fit)
     at = linearize(intervals, fit, weights_of(intervals, fit))
     for n in _FEW:
         if n >= most:
             break
         other = replace(intervals, substeps=n)
-        changed = with_residuals(other, fit)
-        step, cost = _answer(intervals, at, accurate, changed)
+        step, cost = _answer(intervals, at, accurate, other)
         change = np.abs(step.step_p) / np.sqrt(np.diag(step.var_p))
         if (change[: intervals.n_p] < _NEGLIGIBLE).all() and abs(cost) < _NEGLIGIBLE_COST:
             return other, after_step(other, fit, step)
     return finest, accurate
 
 
-def _answer(intervals: ShootingIntervals, at: NormalEquations, fit: Fit, changed: Fit) -> tuple[Factored, float]:
+def _answer(
+    intervals: ShootingIntervals, at: NormalEquations, fit: Fit, other: ShootingIntervals
+) -> tuple[Factored, float]:
     """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats."""
-    own = changed.residuals - fit.residuals
-    jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - changed.ends[:-1], 0.0)
+    own, ends = other.simulated(fit.shared, fit.x, fit.d)
+    own -= fit.residuals
+    jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - ends[:-1], 0.0)
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights, directions=[own], normal_matrix=False)
     z, s = at.by_residuals(intervals, sums.along[:, 0])
     by_jumps_z, by_jumps_s = at.by_jumps(intervals, jumps)
     right_z, right_s = -z - by_jumps_z, -s - by_jumps_s
+    cost = sum((at.weights[k] * own[k] * (fit.residuals[k] + 0.5 * own[k])).sum() for k in row_blocks(len(own)))
+    del own
     step = at.system.solve(right_z, right_s)
-    cost = (at.weights * own * (fit.residuals + 0.5 * own)).sum()
     cost += (at.precision * jumps * (at.jumps + 0.5 * jumps)).sum()
     cost -= 0.5 * ((right_z * step.step_z).sum() + right_s @ step.step_p)
     return step, float(cost)

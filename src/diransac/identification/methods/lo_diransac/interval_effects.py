@@ -20,7 +20,7 @@ _BATCHES = 4
 _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class EffectOfIntervals:
     """Change of a fit's parameters by each interval's measurements, to first order.
 
@@ -60,7 +60,7 @@ def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfInter
     return EffectOfIntervals(steps, s[:n_p], z, s)
 
 
-def batch_sums(values: FloatArray) -> FloatArray:
+def batch_sums(values: FloatArray, usual: int | None = None) -> FloatArray:
     """Sums over neighbouring intervals: their squares count what neighbours have in common.
 
     A batch has about sqrt(W) intervals, or as many as a first-order autoregression of a column asks for (Andrews 1991,
@@ -72,12 +72,14 @@ def batch_sums(values: FloatArray) -> FloatArray:
     ----------
     values : (W, n) array
         Contributions of the intervals to the error of an estimate.
+    usual : int, optional
+        Number of rows of a batch, where these are sums over several intervals.
 
     Returns
     -------
     (n_batches, n) array
     """
-    usual = round(np.sqrt(len(values)))
+    usual = usual or round(np.sqrt(len(values)))
     sums = _sums_of_batches(values, usual)
     for j, length in enumerate(_correlated(values)):
         if length > usual:

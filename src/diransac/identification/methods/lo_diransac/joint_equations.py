@@ -105,7 +105,7 @@ def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArr
     return np.asarray(slopes @ joint.step(joint.right).covariance @ slopes.T)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Slope:
     """Derivatives of the cost, and of its gradient, with respect to one error.
 
@@ -222,33 +222,32 @@ class Scores:
         """Estimates of errors one by one, given all else that is estimated; without those not determined by the log."""
         slopes, n = self._of_groups(kinds), len(self.intervals)
         shares = [(self.weights * np.square(x.sensitivity)).sum(axis=1).reshape(n, -1).sum(axis=1) for x in slopes]
-        tests = scores_tested(
-            self.at,
-            Slopes(
-                share=np.stack(shares, axis=1),
-                rows=np.stack([x.rows for x in slopes], axis=1),
-                of_z=np.stack([x.of_z for x in slopes], axis=-1),
-                of_s=np.stack([x.of_s for x in slopes], axis=-1),
-                by_jumps=np.array([(self.at.precision * np.square(x.jumps)).sum() for x in slopes]),
-                score_of_jumps=np.array([x.of_jumps for x in slopes]),
-            ),
+        together = Slopes(
+            share=np.stack(shares, axis=1),
+            rows=np.stack([x.rows for x in slopes], axis=1),
+            of_z=np.stack([x.of_z for x in slopes], axis=-1),
+            of_s=np.stack([x.of_s for x in slopes], axis=-1),
+            by_jumps=np.array([(self.at.precision * np.square(x.jumps)).sum() for x in slopes]),
+            score_of_jumps=np.array([x.of_jumps for x in slopes]),
         )
-        return [x for k, slope in enumerate(slopes) if (x := self._estimate(slope, tests, k)) is not None]
+        del slopes  # their sensitivities have a number for every sample
+        tests = scores_tested(self.at, together)
+        return [x for k, kind in enumerate(kinds) if (x := self._estimate(kind, tests, k)) is not None]
 
-    def _estimate(self, slope: _Slope, tests: ScoreTests, k: int) -> RecordingError | None:
+    def _estimate(self, kind: ErrorKind, tests: ScoreTests, k: int) -> RecordingError | None:
         """Estimate of the k-th error, or None if the log does not determine it."""
         information, score = float(tests.information[k]), float(tests.score[k])
-        if information <= _least_information(slope.kind) * tests.direct[k]:
+        if information <= _least_information(kind) * tests.direct[k]:
             return None
         n = len(self.intervals)
         batches = np.add.reduceat(tests.scores[:, k], np.arange(0, n, max(1, round(np.sqrt(n)))))
         variance = max(information, float(np.square(batches).sum()))
         size = -score / information
         gain = -0.5 * score * size  # which overflows where the rollouts of a fit nearly do
-        return RecordingError(slope.kind, size, float(np.sqrt(variance)) / information, gain) if gain < np.inf else None
+        return RecordingError(kind, size, float(np.sqrt(variance)) / information, gain) if gain < np.inf else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointStep:
     """Step of a fit and of errors of its recordings.
 
@@ -272,7 +271,7 @@ class JointStep:
 Right = tuple[FloatArray, FloatArray, FloatArray]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointEquations:
     """Gauss-Newton system at a fit, with errors of its recordings as further unknowns.
 
@@ -285,8 +284,8 @@ class JointEquations:
     of_fit : NormalEquations
         Of the fit alone.
     kinds : tuple of ErrorKind
-    rates : (N, n_s) array
-        Change of each signal per sample.
+    rates : (N, n_s) or (1, n_s) array
+        Change of each signal per sample; 0 where no error is one of signals.
     of_z, of_s, jumps : (W, k, E), (n_s, E) and (W - 1, n_x, E) array
         Derivatives with respect to the errors of the gradient of the fit, and of the jumps.
     information : (E, E) array
@@ -336,7 +335,7 @@ class JointEquations:
             fit=scores.fit,
             of_fit=at,
             kinds=tuple(kinds),
-            rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros_like(intervals.measured),
+            rates=scores.rates if any(not x.of_inputs for x in kinds) else np.zeros((1, intervals.measured.shape[1])),
             of_z=stacked([x.of_z for x in slopes], at.right_z),
             of_s=stacked([x.of_s for x in slopes], at.right_s),
             jumps=stacked([x.jumps for x in slopes], at.jumps),

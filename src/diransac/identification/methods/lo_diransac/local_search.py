@@ -105,7 +105,7 @@ class Explanation:
         return np.asarray(np.log(np.sqrt(np.square(left).mean(axis=0)) + 1e-300))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class LocalSearch:
     """Local optimisations of one dataset.
 
@@ -345,8 +345,9 @@ class LocalSearch:
     def _from_hypothesis(self, intervals: ShootingIntervals) -> Explanation:
         """Local optimisation from the best hypothesis, with unmodelled accelerations."""
         report(self.callback, "local optimisation", 0.1)
-        begin = start(self.settings, intervals, self.motion, self.hypothesis, self.prior)
-        return Explanation(refine(self.settings, intervals, begin, self.prior), exact=False)
+        settings, prior = self.settings, self.prior
+        begun = refine(settings, intervals, start(settings, intervals, self.motion, self.hypothesis, prior), prior)
+        return Explanation(begun, exact=False)
 
     def _accurate(self, found: Explanation) -> Explanation:
         """The explanation with the fewest integration steps that it admits; fitted again if these are more."""
@@ -396,7 +397,6 @@ class LocalSearch:
         """
         intervals = replace(intervals, substeps=self.settings.substeps)
         try:
-            begin = with_residuals(intervals, begin)
             refined = refine_exact(self.settings, intervals, begin, self.prior, rival.cost)
         except np.linalg.LinAlgError:
             return None

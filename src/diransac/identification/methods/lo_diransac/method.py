@@ -24,7 +24,6 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
-from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
@@ -38,7 +37,6 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_by_name,
     unmeasured_states,
 )
-from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.equivalents import is_close
 from diransac.identification.structure.refusal import check_signs
@@ -160,6 +158,8 @@ class LoDiransac(LoDiransacSettings):
             The time limit was reached before the first local optimisation had converged.
         """
         if not dataset.model.has_equations:
+            from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
+
             return estimated_by_simulation(self, dataset, int(seed), callback)
         memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
         with memory:
@@ -185,6 +185,8 @@ class LoDiransac(LoDiransacSettings):
         TimeLimitError
             The time limit was reached.
         """
+        from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
+
         nothing: Searched | None = None
         best = dataset.kept(_key(self, seed), lambda: nothing)
         if best is None:  # the model has no equations
@@ -321,7 +323,7 @@ def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding
 # ---------------------------------------------------------------------- the estimate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Found:
     """Parts of an estimate.
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, row_blocks
 from diransac.identification.methods.lo_diransac.motion_equations import (
     equations_of_rows,
     inertia_slopes,
@@ -63,7 +63,7 @@ _ROUNDING = 1e-12
 _HUGE, _TINY = 1e9, 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Candidates:
     """Candidate terms at a fit.
 
@@ -104,7 +104,7 @@ class Candidates:
         return CandidateTests(self.library.terms, self.units, regression.of(slice(n)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class MissingTerms:
     """Terms that the model lacks.
 
@@ -144,16 +144,19 @@ def candidates_of_fit(
     p = fit.shared[: intervals.n_p]
     motion, r, W, M = residuals_of_motion(intervals, fit, p)
     drawn, largest = _drawn(intervals, motion), _largest_forces(intervals, fit, motion, r, W, M)
+    del r, W
     candidates = _library(intervals, motion, drawn, library)
     finer, fit = split(intervals, fit, parts_of_intervals(intervals, fit, len(candidates)))
     means = candidates.means(motion, _weights_of_rows(finer), finer.length)
-    means = np.where(finer.occupied[:, None, None], means, 0.0)
+    means[~finer.occupied] = 0.0
     relative = (np.sqrt(np.square(means).sum(axis=0) / finer.occupied.sum()) / (largest[:, None] + _TINY)).max(axis=0)
     acting = np.isfinite(relative) & (relative > _ROUNDING)
     chosen = np.flatnonzero(acting & ~_replaceable(drawn, candidates))
     means = np.concatenate([means[:, :, chosen], _means(finer, slopes_of_delays(intervals, motion, p))], axis=2)
     inertia, acts = _mean_inertia(intervals, M), (means != 0.0).any(axis=0)
-    accelerations = np.asarray(-np.linalg.solve(_mean_inertia(finer, M), means))
+    accelerations = np.asarray(np.linalg.solve(_mean_inertia(finer, M), means))
+    np.negative(accelerations, out=accelerations)
+    del motion, M, means
     regression = term_regression(finer, fit, result, accelerations, inertia, acts, _inertia_slopes(intervals, drawn))
     found = Candidates(
         replace(candidates, terms=tuple(candidates.terms[k] for k in chosen)),
@@ -301,13 +304,16 @@ def _largest_forces(
 
     In steady motion the inertial force is the smallest of all, and no measure of what a model may lack.
     """
-    of_parameters = W * fit.shared[: intervals.n_p]
-    inertial, known = np.einsum("nij,nj->ni", M, motion[2]), of_parameters.sum(axis=2) - r
-    forces = np.concatenate([of_parameters, inertial[:, :, None], known[:, :, None]], axis=2)[intervals.counted]
-    return np.asarray(np.sqrt(np.square(forces).mean(axis=0)).max(axis=1))
+    squares = 0.0
+    for k in row_blocks(len(r)):
+        of_parameters = W[k] * fit.shared[: intervals.n_p]
+        inertial, known = np.einsum("nij,nj->ni", M[k], motion[2][k]), of_parameters.sum(axis=2) - r[k]
+        forces = np.concatenate([of_parameters, inertial[:, :, None], known[:, :, None]], axis=2)
+        squares = squares + np.square(forces[intervals.counted[k]]).sum(axis=0)
+    return np.asarray(np.sqrt(squares / intervals.counted.sum()).max(axis=1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _DrawnMotion:
     """Motions drawn from the log, signal by signal, so that nothing is correlated; their regressors (n, n_v, n_p)."""
 

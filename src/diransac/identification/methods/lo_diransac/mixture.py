@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, row_blocks
 from diransac.simulation.compiler import order_statistics, padded_rows
 
 # A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
@@ -27,7 +28,7 @@ _ROWS_AT_A_TIME = 4096
 _FAR = 40.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class NoiseSums:
     """Sufficient statistics of the noise of each signal; those of disjoint samples add.
 
@@ -69,7 +70,7 @@ class NoiseSums:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mixture:
     """``(1 - pi) N(0, sigma^2) + pi U(span)``: density of the residuals of each signal.
 
@@ -126,6 +127,11 @@ class Mixture:
             self._loss(residuals[rows], known[rows], found[rows])
         return found
 
+    def loss(self, residuals: FloatArray, known: BoolArray) -> float:
+        """Sum of `negative_log_likelihood`."""
+        parts = (self.negative_log_likelihood(residuals[k], known[k]).sum() for k in row_blocks(len(residuals)))
+        return float(sum(parts))
+
     def _loss(self, residuals: FloatArray, known: BoolArray, out: FloatArray) -> None:
         """Write the result of `negative_log_likelihood`."""
         total, uniform = self._core(residuals, out), self.pi / (2.0 * self.span)
@@ -149,18 +155,16 @@ class Mixture:
         density *= (1.0 - self.pi) / (self.sigma * np.sqrt(2.0 * np.pi))
         return density
 
-    def updated(
-        self, residuals: FloatArray, known: BoolArray, inlying: FloatArray, *, outliers: bool = True
-    ) -> Mixture:
-        """The M step; a scale shrinks to 0.4 of itself at most, so that large residuals keep some weight at first.
+    def updated(self, residuals: FloatArray, known: BoolArray, *, outliers: bool = True) -> Mixture:
+        """The mixture after an E and an M step.
+
+        A scale shrinks to 0.4 of itself at most, so that large residuals keep some weight at first.
 
         Parameters
         ----------
         residuals : (N, n_s) array
         known : (N, n_s) bool array
             Samples that are measured.
-        inlying : (N, n_s) array
-            Result of `inlying`.
         outliers : bool, optional
             Whether the fraction of outliers is estimated; otherwise it remains unchanged.
 
@@ -168,7 +172,9 @@ class Mixture:
         -------
         Mixture
         """
-        return self.of_sums(NoiseSums.of(residuals, known, inlying), outliers=outliers)
+        parts = ((residuals[rows], known[rows]) for rows in row_blocks(len(residuals)))
+        sums = (NoiseSums.of(*x, self.inlying(*x)) for x in parts)
+        return self.of_sums(reduce(NoiseSums.plus, sums), outliers=outliers)
 
     def of_sums(self, sums: NoiseSums, *, outliers: bool = True) -> Mixture:
         """The M step from sufficient statistics; see `updated`.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _FINE_RIDGE = 1e-15
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """A motion with its parameters, and the scales of every term of the cost.
 
@@ -93,7 +93,7 @@ class Fit:
         return np.where(intervals.linked[:, None], self.x[1:] - self.ends[:-1], 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class NormalEquations:
     """Gauss-Newton system at a fit.
 
@@ -220,13 +220,15 @@ def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingI
     -------
     ShootingIntervals, Fit
     """
-    finer, n_x = intervals.split(parts), fit.x.shape[1]
-    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
-    x = series[:, :: finer.length, :n_x].reshape(-1, n_x)
     # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
     slow = parts * (1.0 + fit.rho)
-    rho = (slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho)
-    return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0), rho=rho))
+    fit = replace(fit, rho=(slow - 1.0 + fit.rho) / (slow + 1.0 - fit.rho))
+    if parts == 1:
+        return intervals, fit
+    finer, n_x = intervals.split(parts), fit.x.shape[1]
+    series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
+    x = series[:, :: finer.length, :n_x].reshape(-1, n_x).copy()  # a view would keep all rows
+    return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0)))
 
 
 def linearize(
@@ -483,4 +485,6 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     -------
     (N, n_signals) array
     """
-    return fit.noise.inlying(fit.residuals, intervals.known) / np.square(fit.noise.sigma)
+    found = fit.noise.inlying(fit.residuals, intervals.known)
+    found /= np.square(fit.noise.sigma)
+    return found

@@ -312,8 +312,7 @@ def _with_scales(predictor: Predictor, now: Pass, *, outliers: bool) -> Predicto
 def _noise_after(predictor: Predictor, now: Pass, *, outliers: bool) -> Mixture:
     """The noise by the residuals of a pass."""
     known = predictor.intervals.known
-    inlying = predictor.noise.inlying(now.residuals, known)
-    return predictor.noise.updated(now.residuals, known, inlying, outliers=outliers)
+    return predictor.noise.updated(now.residuals, known, outliers=outliers)
 
 
 def _bounds_of_step(predictor: Predictor, p: FloatArray, *, held: bool = False) -> tuple[FloatArray, FloatArray]:

@@ -120,13 +120,14 @@ def screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Sam
     dt : float
         Sampling time, s.
     """
-    model, notes = one.model, []
-    measured = np.full((len(one), len(model.signals)), np.nan)
-    measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
+    model, notes, measured = one.model, [], one.measured
+    if one.signals != tuple(model.signals):
+        measured = np.full((len(one), len(model.signals)), np.nan)
+        measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
     present = [one.signals.index(n) for n in one.present]
     stuck = stuck_rows(one.measured[:, present]) if settings.stuck_rows else np.zeros(len(one), bool)
     known = np.isfinite(measured) & ~stuck[:, None]
-    measured = np.where(known, measured, 0.0)
+    measured = measured if known.all() else np.where(known, measured, 0.0)
     inputs, n_leaps = screened_inputs(
         one.inputs, odd_window(settings.input_window, dt, _MOST_INPUTS), settings.input_threshold
     )

@@ -62,7 +62,7 @@ _EQUATIONS = 8
 _REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ProjectedEstimate:
     """Parameters that hold for the whole motion.
 
@@ -134,27 +134,16 @@ def projected_candidates(
     wide = _with_wide_priors(intervals, fit)
     now, rows = wide.shared[: intervals.n_p], _Rows.of(intervals, wide)
     for windows in _windows(intervals, len(now), rows.latent.shape[1]):
-        p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+        p, gains, _ = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
         seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
-        yield (
-            seconds,
-            partial(_completed, intervals, fit, rows, windows, p, gains, stuck),
-            p,
-            _parts(intervals, rows, gains),
-        )
+        parts = _parts(intervals, rows, gains)
+        del gains  # of every row: found again for an estimate that is asked for
+        yield seconds, partial(_completed, intervals, fit, rows, windows), p, parts
 
 
-def _completed(
-    intervals: ShootingIntervals,
-    fit: Fit,
-    rows: _Rows,
-    windows: IntArray,
-    p: FloatArray,
-    gains: tuple[FloatArray, FloatArray],
-    stuck: BoolArray,
-) -> ProjectedEstimate:
+def _completed(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
     """The estimate over some windows with its covariance, and with priors."""
-    found = _solution(intervals, _with_wide_priors(intervals, fit), rows, windows, p, gains, stuck)
+    found = _solution(intervals, _with_wide_priors(intervals, fit), rows, windows)
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
@@ -250,7 +239,7 @@ def with_parameters(
     return replace(found, parameters=parameters, unexplained=left)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Rows:
     """Equations on the fitted motion, ``r(p) = g + M d`` with discrepancies g and unmodelled accelerations d.
 
@@ -292,22 +281,16 @@ class _Rows:
         return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
 
 
-def _solution(
-    intervals: ShootingIntervals,
-    fit: Fit,
-    rows: _Rows,
-    windows: IntArray,
-    p: FloatArray,
-    gains: tuple[FloatArray, FloatArray],
-    stuck: BoolArray,
-) -> ProjectedEstimate:
+def _solution(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
     The component of the discrepancies and of the unmodelled accelerations in the regressor's column space is attributed
     to the parameters: of the discrepancies row by row; of the accelerations, which are constant over an interval, by
     interval means.
     """
-    plain = _bounded_projection(intervals, fit.shared[: intervals.n_p], rows, windows, 0)[0]
+    now = fit.shared[: intervals.n_p]
+    p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+    plain = _bounded_projection(intervals, now, rows, windows, 0)[0]
     slopes = _slopes(intervals, fit, rows, gains)
     covariance = _covariance_of_fit(intervals, fit, *slopes)
     sums = batch_sums(_parts(intervals, rows, gains))

@@ -70,7 +70,7 @@ _LOST, _RECENT, _MORE = 2.5, 4, 10
 _UPDATES, _SETTLED = 20, 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prior:
     """Prior sizes of the discrepancies; each has the weight of one interval.
 
@@ -272,6 +272,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
         The time limit was reached.
     """
     damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
+    del fit
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
@@ -280,6 +281,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
         updated = _update(settings, intervals, taken.fit, solved, prior)
         errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
         converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors)
+        del at, taken, solved  # the next equations take as much memory
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
@@ -316,6 +318,7 @@ def refine_exact(
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
     at, behind = linearized(intervals, fit), list[float]()
+    del fit
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1
@@ -323,8 +326,7 @@ def refine_exact(
         intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
         if rival < np.inf:
             behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
-        inlying = moved.noise.inlying(moved.residuals, intervals.known)
-        noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
+        noise = moved.noise.updated(moved.residuals, intervals.known, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
         jumps = (
             np.clip(unbroken_jumps(at.fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
@@ -333,6 +335,7 @@ def refine_exact(
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
         settled = bool((tau == at.fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
         converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        del at, taken, solved, moved
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
@@ -349,10 +352,10 @@ def _least_loss(intervals: ShootingIntervals, fit: Fit, *, outliers: bool) -> fl
     """Negative log-likelihood of the samples with the likeliest noise: that of a fit lags behind its residuals."""
     noise, residuals, known, loss = fit.noise, fit.residuals, intervals.known, np.inf
     for _ in range(_UPDATES):
-        before, loss = loss, float(noise.negative_log_likelihood(residuals, known).sum())
+        before, loss = loss, noise.loss(residuals, known)
         if before - loss < _SETTLED * known.sum():
             break
-        noise = noise.updated(residuals, known, noise.inlying(residuals, known), outliers=outliers)
+        noise = noise.updated(residuals, known, outliers=outliers)
     return loss
 
 
@@ -383,8 +386,8 @@ def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float
     float
         Infinite where a rollout diverges.
     """
-    loss = fit.noise.negative_log_likelihood(fit.residuals, intervals.known).sum()
-    beforehand = cost(intervals, fit, np.zeros_like(fit.residuals))
+    loss = fit.noise.loss(fit.residuals, intervals.known)
+    beforehand = cost(intervals, fit, np.broadcast_to(0.0, fit.residuals.shape))
     if not np.isfinite(loss + beforehand):
         return np.inf
     std = innovation_std(intervals, fit)
@@ -399,8 +402,7 @@ def _update(
     settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, solved: Factored, prior: Prior
 ) -> Fit:
     """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
-    inlying = fit.noise.inlying(fit.residuals, intervals.known)
-    noise = fit.noise.updated(fit.residuals, intervals.known, inlying, outliers=settings.outliers)
+    noise = fit.noise.updated(fit.residuals, intervals.known, outliers=settings.outliers)
     sums = process_sums(intervals, fit, solved).total()
     tau, rho = sums.most_probable_size(prior.tau, fit.tau), sums.correlation(prior.tau)
     if not settings.model_error:

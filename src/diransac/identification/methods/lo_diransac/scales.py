@@ -36,7 +36,7 @@ _CHANCE, _TINY = 2.0, 1e-300
 _MOST_ALIKE = 0.98
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ProcessSums:
     """Sufficient statistics of the unmodelled accelerations, of all or of each of W intervals.
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _TINY = 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Slopes:
     """Derivatives of the cost, and of its gradient, with respect to K effects.
 
@@ -58,7 +58,7 @@ class Slopes:
         return np.asarray(self.share.sum(axis=0) + self.by_jumps)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ScoreTests:
     """Score tests of K effects one by one.
 

@@ -70,7 +70,7 @@ class Decided:
     n_rows: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Searched:
     """The likeliest explanation of the logs, and the motion that its search began with.
 

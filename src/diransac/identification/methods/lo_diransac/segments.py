@@ -32,7 +32,7 @@ OUTLYING = 6.0
 """Robust standard deviations from which on a sample is far from a motion."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ActingInputs:
     """Inputs as they act.
 
@@ -75,7 +75,7 @@ class ActingInputs:
         return cls(intervals.recorded, hold, InputTiming())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Segments:
     """Segments of equal length of the rows of all logs.
 
@@ -223,7 +223,7 @@ class Segments:
         return found.reshape(states.shape)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _States:
     """Initial states of segments with given parameters, with a Gaussian prior: few samples may not determine them."""
 

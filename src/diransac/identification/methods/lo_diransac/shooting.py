@@ -30,7 +30,7 @@ _WELL_CONDITIONED = 1e8
 _WORTH_THREADS = 4e6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ShootingIntervals:
     """Rows of all logs as intervals of ``length`` rows; made by `of`, which pads the last interval of each log.
 
@@ -119,8 +119,8 @@ class ShootingIntervals:
         """
         sizes = [len(log[2]) for log in logs]
         missing = [-n % length for n in sizes]
-        measured = np.concatenate([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
-        recorded = np.concatenate([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
+        measured = _joined([_filled_up(log[0], more) for log, more in zip(logs, missing, strict=True)])
+        recorded = _joined([_filled_up(log[2], more) for log, more in zip(logs, missing, strict=True)])
         sampled = np.concatenate([np.pad(log[1], ((0, n), (0, 0))) for log, n in zip(logs, missing, strict=True)])
         gaps = np.concatenate([np.pad(log[3], (0, n)) for log, n in zip(logs, missing, strict=True)])
         is_logged = np.concatenate([np.arange(n + more) < n for n, more in zip(sizes, missing, strict=True)])
@@ -155,7 +155,7 @@ class ShootingIntervals:
     @cached_property
     def known(self) -> BoolArray:
         """Samples ``(N, n_s)`` that are measured, and reached by a simulation."""
-        return self.sampled & self._reached[:, None]
+        return self.sampled if self._reached.all() else self.sampled & self._reached[:, None]
 
     @cached_property
     def counted(self) -> BoolArray:
@@ -170,6 +170,8 @@ class ShootingIntervals:
     @cached_property
     def log_of_row(self) -> IntArray:
         """Log of each row ``(N,)``."""
+        if self.layout.n_logs == 1:
+            return np.broadcast_to(self.log_of[:1], len(self.is_logged))
         return np.repeat(self.log_of, self.length)
 
     @cached_property
@@ -213,7 +215,7 @@ class ShootingIntervals:
         timing = errors.input_delay, errors.input_lag, errors.gain_drift
         n_rows = [int(self.is_logged[rows].sum()) for rows in self.rows_of_logs]
         logs = zip(self.rows_of_logs, n_rows, strict=True)
-        return np.concatenate([acting_inputs(self.recorded[rows], *timing, self.hold, n) for rows, n in logs])
+        return _joined([acting_inputs(self.recorded[rows], *timing, self.hold, n) for rows, n in logs])
 
     @cached_property
     def later_inputs(self) -> FloatArray:
@@ -334,7 +336,7 @@ class ShootingIntervals:
         -------
         RolloutBatch
         """
-        logs, starts = self.log_of, self.starts
+        logs, starts, rows = self.log_of, self.starts, self._rows_about(chosen)
         if chosen is not None:
             logs, starts, x, d = logs[chosen], starts[chosen], x[chosen], d[chosen]
         parameters = np.empty((len(x), self.model.n_p + len(shared) - self.n_p + d.shape[1]))
@@ -344,17 +346,24 @@ class ShootingIntervals:
         return RolloutBatch(
             parameters,
             x,
-            self.inputs,
+            self.inputs[rows],
             self.dt,
-            starts,
+            starts - rows.start,
             self.length,
-            self.first_of_log,
+            self.first_of_log - rows.start,
         )
 
-    @cached_property
-    def measurements(self) -> Measurements:
+    def _rows_about(self, chosen: IntArray | None) -> slice:
+        """Rows from the first to the last of chosen intervals, and the two about them on which inputs depend."""
+        if chosen is None:
+            return slice(0, len(self.measured))
+        first, last = int(chosen.min()) * self.length, (int(chosen.max()) + 1) * self.length
+        return slice(max(first - 2, 0), last + 2)
+
+    def measurements(self, rows: slice = slice(None), columns: IntArray | slice = slice(None)) -> Measurements:
         """Measured signals; all rows count, and unknown samples have no weight."""
-        return Measurements(self.measured, np.ones(len(self.measured), bool))
+        values = self.measured[rows, columns]
+        return Measurements(values, np.ones(len(values), bool))
 
     def simulated(
         self, shared: FloatArray, x: FloatArray, d: FloatArray, chosen: IntArray | None = None
@@ -373,7 +382,8 @@ class ShootingIntervals:
         (n, n_x) array
             States one row after the last of each interval, NaN where it diverges.
         """
-        errors, ends = self.rollouts.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements)
+        rows = self._rows_about(chosen)
+        errors, ends = self.rollouts.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements(rows))
         if not np.isfinite(errors).all():
             np.nan_to_num(errors, copy=False, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
         return errors.reshape(-1, errors.shape[2]), ends
@@ -409,17 +419,16 @@ class ShootingIntervals:
         -------
         GaussNewtonBatch
         """
-        derived, columns = self._derived
+        (derived, columns), rows = self._derived, self._rows_about(chosen)
         batch, unknowns = self.batch(shared, x, d, chosen), self.augmented.unknowns
-        threads = self.threads if len(self.measured) * len(unknowns) ** 2 > _WORTH_THREADS else 1
-        measurements = Measurements(self.measured[:, columns], self.measurements.valid)
+        threads = self.threads if batch.n_log * len(unknowns) ** 2 > _WORTH_THREADS else 1
         return derived.gauss_newton(
             batch,
-            measurements,
-            weights[:, columns],
+            self.measurements(rows, columns),
+            weights[rows, columns],
             unknowns=unknowns,
             normal_matrix=normal_matrix,
-            directions=np.stack([x[:, columns] for x in directions], axis=1) if directions else None,
+            directions=np.stack([x[rows, columns] for x in directions], axis=1) if directions else None,
             threads=threads,
         )
 
@@ -438,7 +447,8 @@ class ShootingIntervals:
 
         One Newton step; states are unchanged where it has no solution.
         """
-        sums = self.gauss_newton(shared, x, d, np.zeros(self.measured.shape), chosen=chosen, normal_matrix=False)
+        nothing = np.broadcast_to(0.0, self.measured.shape)
+        sums = self.gauss_newton(shared, x, d, nothing, chosen=chosen, normal_matrix=False)
         jumps, slopes = x[chosen + 1] - sums.final_states, sums.final_slopes[:, :, : x.shape[1]]
         finite = np.isfinite(jumps).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
         usable = np.flatnonzero(finite)
@@ -446,6 +456,11 @@ class ShootingIntervals:
         found = x[chosen]
         found[usable] += np.linalg.solve(slopes[usable], jumps[usable][:, :, None])[:, :, 0]
         return found
+
+
+def _joined(logs: Sequence[FloatArray]) -> FloatArray:
+    """Rows of all logs; a single one is not copied."""
+    return np.concatenate(logs) if len(logs) > 1 else logs[0]
 
 
 def _differences(values: FloatArray) -> FloatArray:

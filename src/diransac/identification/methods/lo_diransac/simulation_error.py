@@ -217,7 +217,7 @@ def _first_states(
     return segments.estimated_states(lanes, states, spread, weights), mean, spread
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Solution:
     """Parameters with the initial states of all segments.
 
@@ -266,7 +266,7 @@ class _Solution:
     def cost(self) -> float:
         """Negative logarithm of the probability of samples and states."""
         of_states = 0.5 * np.square((self.states - self.mean) / self.spread).sum()
-        return float(self.noise.negative_log_likelihood(self.errors, self._known).sum() + of_states)
+        return float(self.noise.loss(self.errors, self._known) + of_states)
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray]:
@@ -302,8 +302,7 @@ class _Solution:
         now, damping = self, _DAMPING
         for _ in range(steps):
             check_time()
-            inlying = now.noise.inlying(now.errors, now._known)
-            noise = now.noise.updated(now.errors, now._known, inlying, outliers=bool(now.noise.pi.any()))
+            noise = now.noise.updated(now.errors, now._known, outliers=bool(now.noise.pi.any()))
             is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
             now = replace(now, noise=noise)
             then, change, damping = now._stepped(damping)

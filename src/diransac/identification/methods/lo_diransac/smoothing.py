@@ -14,15 +14,17 @@ non-convexity); Cleveland 1979 (robust local regression).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, row_blocks
 from diransac.data.checks import rows_per_sample
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.simulation.compiler import compile_map
@@ -45,11 +47,11 @@ _UNINFORMED = 1e-9
 _FEWEST, _ENOUGH_SAMPLES = 5, 25
 # Residuals that a scale is taken from; more would only cost time.
 _ENOUGH = 4000
-# Numbers of the windows of chains that are fitted together at most; more would only take memory.
+# Numbers of the windows that are fitted together at most; more would only take memory.
 _NUMBERS_TOGETHER = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Samples:
     """Samples of one log, in the model's order of signals.
 
@@ -71,7 +73,7 @@ class Samples:
     gaps: BoolArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """Smoothed motion.
 
@@ -86,7 +88,7 @@ class Motion:
     signals: FloatArray
     spread: FloatArray
 
-    def parts(self, model: Model, rows: BoolArray | IntArray) -> list[FloatArray]:
+    def parts(self, model: Model, rows: BoolArray | IntArray | slice) -> list[FloatArray]:
         """Coordinates, velocities, accelerations and sensors in some rows."""
         return split_signals(model, self.signals[rows])
 
@@ -154,7 +156,7 @@ def _smoothed(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatA
 
     Sensors are smoothed one by one; they are NaN in rows without a sample nearby.
     """
-    measured, known, centre = log.measured.copy(), log.known.copy(), log.centre.copy()
+    measured, known, centre = log.measured, log.known, log.centre
     signals = np.zeros(measured.shape)
     chains = _chains(model)
 
@@ -172,6 +174,7 @@ def _smoothed(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatA
         lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : n_x].any(axis=0))
         if len(lacking):
             inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
+            measured, known, centre = measured.copy(), known.copy(), centre.copy()
             measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
     for columns, half in _alike(chains, halves, 4 * len(measured)):  # a row is in four windows
@@ -184,15 +187,16 @@ def _smoothed(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatA
         if near.any():
             signals[near, k] = smoothed(np.array([[k]]), halves[k])[near, 0, 0]
     rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
-    return signals if log.gaps.all() else np.column_stack([np.interp(rows, seen, x[seen]) for x in signals.T])
+    for x in signals.T if len(seen) else ():
+        x[:] = np.interp(rows, seen, x[seen])
+    return signals
 
 
 def _with_wider_windows(
     values: FloatArray, known: BoolArray, centre: FloatArray, gaps: BoolArray, dt: float, half: int, derivatives: int
 ) -> FloatArray:
     """Smoothed chains, as `_Smoother.smoothed`; rows with too few samples about them are those of wider windows."""
-    smoother = _Smoother.of(len(values), dt, half)
-    found, informed = smoother.smoothed(values, known, centre, derivatives)
+    found, informed = _Smoother.of(dt, half).smoothed(values, known, centre, derivatives)
     lacking = ~(informed | gaps[:, None])
     some = np.flatnonzero(lacking.any(axis=0) & known.any(axis=(0, 2)))
     if len(some) and _WIDER * half < len(values):
@@ -255,34 +259,27 @@ def _integrate(signals: FloatArray, known: BoolArray, columns: Sequence[int], dt
         signals[:, columns[j - 1]] = integral - integral.mean()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Smoother:
-    """Overlapping windows of one log, whose polynomials are blended.
+    """Overlapping windows, whose polynomials are blended; their knots are ``step`` rows apart.
 
     Parameters
     ----------
-    rows : (K, 2 half + 1) int array
-        Rows about each knot.
-    inside : (K, 2 half + 1) bool array
-        Those that are in the log.
+    step : int
     basis : (4, 2 half + 1, 5) array
         Polynomials and their derivatives.
     blend : (2 half + 1,) array
         Weight of a polynomial by its distance from the knot.
     """
 
-    rows: IntArray
-    inside: BoolArray
+    step: int
     basis: FloatArray
     blend: FloatArray
 
     @classmethod
-    def of(cls, n_rows: int, dt: float, half: int) -> _Smoother:
-        step = max(1, half // 2)
-        rows, inside = _neighbourhoods(np.arange(0, n_rows, step), half, n_rows)
-        offsets = np.arange(-half, half + 1)
-        blend = np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0))
-        return cls(rows, inside, _basis(offsets / half, half * dt), blend)
+    def of(cls, dt: float, half: int) -> _Smoother:
+        step, offsets = max(1, half // 2), np.arange(-half, half + 1)
+        return cls(step, _basis(offsets / half, half * dt), np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0)))
 
     def smoothed(
         self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int
@@ -291,21 +288,33 @@ class _Smoother:
 
         A mask ``(N, C)`` is that of the rows in a window with more samples than its polynomial has coefficients.
         """
-        (N, C, c), n = values.shape, values.shape[2] + derivatives
-        inside, at = self.inside, self.rows[self.inside]
-        oks = _windows(known, self.rows) & inside[:, :, None]
-        first, measured = _windows(values - centre, self.rows), _windows(values, self.rows)
-        coefficients = _coefficients(measured, oks, first, self.basis[:c], _spread(centre))
-        blended, informed = np.empty((N, C, n)), np.empty((N, C), bool)
+        (N, C, c), n, n_t = values.shape, values.shape[2] + derivatives, len(self.blend)
+        some, oks, about = self._windows(values), self._windows(known), self._windows(centre)
+        coefficients = _coefficients(some, oks, about, self.basis[:c], _spread(centre))
+        log, of_rows = slice(n_t // 2, n_t // 2 + N), np.zeros((C, 1 + n, (oks.shape[1] + 1) * self.step + n_t))
         for i, (own, ok) in enumerate(zip(coefficients, oks, strict=True)):
-            fitted = np.einsum("ka,jta->ktj", own, self.basis[:n])
-            enough = ok.any(axis=2).sum(axis=1) > _DEGREE + 1
-            weight = (self.blend * np.where(enough, 1.0, _UNINFORMED)[:, None])[inside]
-            total = np.bincount(at, weight, N)
-            informed[:, i] = total > _UNINFORMED * len(self.blend)
-            for j in range(n):
-                blended[:, i, j] = np.bincount(at, fitted[inside, j] * weight, N) / total
-        return blended, informed
+            for knots in row_blocks(len(ok), max(1, 8 * _NUMBERS_TOGETHER // ok[0].size)):
+                fitted = np.einsum("ka,jta->ktj", own[knots], self.basis[:n])
+                enough = ok[knots].any(axis=2).sum(axis=1) > _DEGREE + 1
+                weight = self.blend * np.where(enough, 1.0, _UNINFORMED)[:, None]
+                self._add(of_rows[i, 0, knots.start * self.step :], weight)
+                for j in range(n):
+                    self._add(of_rows[i, 1 + j, knots.start * self.step :], fitted[:, :, j] * weight)
+        of_rows = of_rows[:, :, log]
+        of_rows[:, 1:] /= of_rows[:, :1]
+        return np.moveaxis(of_rows[:, 1:], 2, 0), (of_rows[:, 0] > _UNINFORMED * n_t).T
+
+    def _windows(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Views ``(C, K, n_t, c)`` of chains ``(N, C, c)`` about every knot; no sample is known beyond the log."""
+        wide = (0, 0), (len(self.blend) // 2,) * 2, (0, 0)
+        rows = np.pad(np.moveaxis(values, 1, 0), wide, mode="constant" if values.dtype == bool else "edge")
+        return np.moveaxis(sliding_window_view(rows, len(self.blend), axis=1)[:, :: self.step], 3, 2)
+
+    def _add(self, rows: FloatArray, windows: FloatArray) -> None:
+        """Add windows ``(K, n_t)`` of successive knots to rows from the first of the first one on, knot by knot."""
+        for t in reversed(range(0, windows.shape[1], self.step)):
+            some = windows[:, t : t + self.step]
+            rows[t : t + len(some) * self.step].reshape(len(some), -1)[:, : some.shape[1]] += some
 
 
 def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> tuple[IntArray, int]:
@@ -340,7 +349,8 @@ def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowe
     )
     factors = [k for k in range(20) if k == 0 or 8 * length * _WIDER**k < longest]
     candidates = [np.maximum(usual // _WIDER, _FEWEST * apart), *(usual * _WIDER**k for k in factors)]
-    tried = [_prediction_errors(model, logs, dt, halves, usual, apart) for halves in candidates]
+    spread = _spread(_joined(model, [log.centre for log in logs]))
+    tried = [_prediction_errors(model, logs, dt, halves, usual, apart, spread) for halves in candidates]
     best = 1 + int(np.argmin([np.log(errors).sum() for errors, _ in tried[1:]]))
     # Narrower windows have noisier derivatives: they are taken where the others miss a visible part of the motion.
     visible = [float(np.log(np.maximum(first, _VISIBLE)).sum()) for _, first in tried]
@@ -349,38 +359,38 @@ def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowe
 
 
 def _prediction_errors(
-    model: Model, logs: Sequence[Samples], dt: float, halves: IntArray, usual: IntArray, apart: IntArray
+    model: Model,
+    logs: Sequence[Samples],
+    dt: float,
+    halves: IntArray,
+    usual: IntArray,
+    apart: IntArray,
+    sizes: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Robust scale of the left-out samples over a signal's spread: of each signal, and of the first of each chain."""
     measured, known, centre = (
         np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
         for name in ("measured", "known", "centre")
     )
-    about, sizes = _joined(model, [log.centre for log in logs]), [len(log.measured) for log in logs]
     found, first_of_chains = list[FloatArray](), list[float]()
     for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
         k = columns[0, 0]
         stride = max(1, half // usual[k]) if apart[k] == 1 else 1
         offsets = np.arange(-half, half + 1, stride)
-        rows = _trial_rows(sizes, _TRIALS * max(1, usual[k] // half), half, offsets)
+        rows = _trial_rows([len(log.measured) for log in logs], _TRIALS * max(1, usual[k] // half), half, offsets)
         near = np.abs(offsets) <= half // 2
         basis = _basis(offsets / half, half * dt)
-        values, oks = _windows(measured[:, columns], rows), _windows(known[:, columns], rows)
-        first = values - _windows(centre[:, columns], rows)
-        spread, even, orders = _spread(about[:, columns]), _every_other(oks), basis[: columns.shape[1]]
-        coefficients = _coefficients(values, oks & even, first, orders, spread)
+        values, oks, about = (np.moveaxis(x[:, columns][rows], 2, 0) for x in (measured, known, centre))
+        spread, even, orders = sizes[columns], _every_other(oks), basis[: columns.shape[1]]
+        coefficients = _coefficients(values, oks & even, about, orders, spread)
         fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
-        scale = _scale(values - fitted, oks & near[:, None] & ~even)
+        tested, n = oks & near[:, None] & ~even, oks.shape[1] * oks.shape[2]
+        scale = _scale(_sampled([values - fitted], n), _sampled([tested], n))
         seen: BoolArray = np.asarray(oks.any(axis=(1, 2)))
         errors = np.maximum(scale, _FLOOR * spread + 1e-12) / (spread + 1e-12)
         found.append(errors[seen])
         first_of_chains += [float(own[ok][0]) for own, ok in zip(errors, seen, strict=True) if ok.any()]
     return np.concatenate(found), np.array(first_of_chains)
-
-
-def _windows(values: NDArray[Scalar], rows: IntArray) -> NDArray[Scalar]:
-    """Values ``(C, K, n_t, c)`` of chains ``(N, C, c)`` in the rows ``(K, n_t)`` of each window."""
-    return np.ascontiguousarray(np.moveaxis(values, 1, 0))[:, rows]
 
 
 def _every_other(known: BoolArray) -> BoolArray:
@@ -409,17 +419,15 @@ def _trial_rows(sizes: Sequence[int], trials: int, half: int, offsets: IntArray)
     return np.concatenate(rows)
 
 
-def _neighbourhoods(knots: IntArray, half: int, n_rows: int) -> tuple[IntArray, BoolArray]:
-    """Rows about each knot (K, 2 half + 1), and which of them are in the log."""
-    rows = knots[:, None] + np.arange(-half, half + 1)
-    return np.clip(rows, 0, n_rows - 1), (rows >= 0) & (rows < n_rows)
-
-
 def _spread(values: FloatArray) -> FloatArray:
     """Standard deviation of each column by the MAD; by the central 80 % where half the samples have one value."""
-    low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
-    mad, wide = robust_std(values - median, axis=0), (high - low) / 2.563
-    return np.asarray(np.where(mad > _AT_REST * wide, mad, wide))
+
+    def of_one(own: FloatArray) -> float:
+        low, median, high = np.quantile(own, [0.1, 0.5, 0.9])
+        mad, wide = float(robust_std(own - median)), float(high - low) / 2.563
+        return mad if mad > _AT_REST * wide else wide
+
+    return np.apply_along_axis(of_one, 0, values)
 
 
 def _spread_of_known(values: FloatArray) -> FloatArray:
@@ -438,39 +446,55 @@ def _basis(t: FloatArray, unit: float) -> FloatArray:
 
 
 def _coefficients(
-    values: FloatArray, known: BoolArray, residuals: FloatArray, basis: FloatArray, spread: FloatArray
+    values: FloatArray, known: BoolArray, centre: FloatArray, basis: FloatArray, spread: FloatArray
 ) -> FloatArray:
     """Coefficients ``(C, K, 5)`` of the polynomials of C chains of c signals, ``(C, K, n_t, c)``."""
     C, K, n_t, c = values.shape
     floor = _FLOOR * spread + 1e-12
-    scale = np.maximum(_scale(residuals, known), floor)
     products = np.einsum("jta,jtb->tjab", basis, basis).reshape(n_t * c, -1)
     flat = basis.swapaxes(0, 1).reshape(n_t * c, -1)
-    shape = (C, K, n_t * c)
-    values, measured, residuals = values.reshape(shape), known.reshape(shape).astype(float), residuals.reshape(shape)
-    weights = np.empty(shape)
-    for _ in range(_STEPS):
-        np.multiply(residuals, np.tile(1.0 / (3.0 * scale), n_t)[:, None], out=weights)
-        weights *= weights
-        weights += 1.0
-        weights *= weights
-        weights *= np.tile(np.square(scale), n_t)[:, None]
-        np.divide(measured, weights, out=weights)
-        G = (weights.reshape(C * K, -1) @ products).reshape(C * K, _DEGREE + 1, _DEGREE + 1)
-        weights *= values
-        h = weights.reshape(C * K, -1) @ flat
-        d = np.sqrt(np.einsum("kii->ki", G)) + 1e-12
-        G = G / d[:, :, None] / d[:, None, :] + 1e-9 * np.eye(_DEGREE + 1)
-        coefficients = np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d
-        residuals = values - (coefficients @ flat.T).reshape(shape)
-        scale = np.maximum(np.maximum(_scale(residuals.reshape(known.shape), known), floor), _SHRINK * scale)
-    return np.asarray(coefficients.reshape(C, K, -1))
+    found = np.empty((C, K, _DEGREE + 1))
+    blocks = list(row_blocks(K, max(1, 8 * _NUMBERS_TOGETHER // (C * n_t * c))))  # of three signals, some 60,000 rows
+    seen = _sampled((known[:, k] for k in blocks), K * n_t)
+
+    @lru_cache(maxsize=1)
+    def left(i: int, step: int) -> FloatArray:
+        """Residuals ``(C, K, n_t, c)`` of a block before a step: of the last one's polynomials, or of the centre."""
+        of = blocks[i]
+        fitted = (found[:, of].reshape(-1, _DEGREE + 1) @ flat.T).reshape(C, -1, n_t, c) if step else centre[:, of]
+        return np.asarray(values[:, of] - fitted)
+
+    scale = np.zeros((C, c))
+    for step in range(_STEPS):
+        own = _scale(_sampled((left(i, step) for i in range(len(blocks))), K * n_t), seen)
+        scale = np.maximum(np.maximum(own, floor), _SHRINK * scale)
+        for i, k in enumerate(blocks):
+            weights = left(i, step).reshape(C, -1, n_t * c)
+            weights *= np.tile(1.0 / (3.0 * scale), n_t)[:, None]
+            weights *= weights
+            weights += 1.0
+            weights *= weights
+            weights *= np.tile(np.square(scale), n_t)[:, None]
+            np.divide(known[:, k].reshape(weights.shape), weights, out=weights)
+            G = (weights.reshape(-1, n_t * c) @ products).reshape(-1, _DEGREE + 1, _DEGREE + 1)
+            weights *= values[:, k].reshape(weights.shape)
+            h = weights.reshape(-1, n_t * c) @ flat
+            d = np.sqrt(np.einsum("kii->ki", G)) + 1e-12
+            G = G / d[:, :, None] / d[:, None, :] + 1e-9 * np.eye(_DEGREE + 1)
+            found[:, k] = (np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d).reshape(C, -1, _DEGREE + 1)
+    return found
+
+
+def _sampled(blocks: Iterable[NDArray[Scalar]], n: int) -> NDArray[Scalar]:
+    """Every so many of the n rows of all windows, ``(C, m, c)``; blocks are ``(C, K, n_t, c)``, one after the other."""
+    every, at, found = max(1, n // _ENOUGH) | 1, 0, []
+    for one in blocks:
+        rows = one.reshape(len(one), -1, one.shape[3])
+        found.append(rows[:, -at % every :: every])
+        at += rows.shape[1]
+    return np.concatenate(found, axis=1)
 
 
 def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
     """Robust standard deviation ``(C, c)`` of each chain's signals; one where nothing is measured."""
-    C, K, n_t, c = residuals.shape
-    flat, seen = residuals.reshape(C, K * n_t, c), known.reshape(C, K * n_t, c)
-    every = max(1, K * n_t // _ENOUGH) | 1
-    scale = lower_scale(flat[:, ::every], seen[:, ::every])
-    return np.where(np.isnan(scale), 1.0, scale)
+    return np.nan_to_num(lower_scale(residuals, known), nan=1.0, posinf=np.inf)

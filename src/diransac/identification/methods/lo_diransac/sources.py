@@ -32,7 +32,7 @@ _MOST_ROWS = 3000
 """Rows of nonlinear least squares at most: neighbours of filtered signals tell the same."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Blocks:
     """Stretches of time of about equal length, each of which is left out in turn.
 
@@ -57,7 +57,7 @@ class Blocks:
         return cls(found, N_BLOCKS)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Candidate:
     """An estimate of the parameters, and what it is without each block of the logs.
 

@@ -49,7 +49,7 @@ _SMALLEST, _SHARE = 1e-3, 0.2
 _ROUNDING, _SEPARATE, _TINY = 1e-12, 1e-9, 1e-300
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class TermRegression:
     """Residuals of a fit as linear functions of the coefficients of K effects, all else estimated with them.
 
@@ -71,6 +71,8 @@ class TermRegression:
         Equations in which each effect acts.
     inertia : (n,) array
         Slopes of the logarithm of the inertia by the parameters.
+    batch : int, optional
+        Rows of a batch of correlated ones, as in `batch_sums`.
     """
 
     effects: FloatArray
@@ -81,6 +83,7 @@ class TermRegression:
     forces: FloatArray
     acts: BoolArray
     inertia: FloatArray
+    batch: int | None = None
 
     def estimates(self) -> tuple[FloatArray, FloatArray]:
         """Estimate and variance ``(K,)`` of each coefficient alone; 0 and infinite where the log determines none."""
@@ -90,7 +93,7 @@ class TermRegression:
         determined = information > _ROUNDING * self.direct
         information = np.where(determined, information, 1.0)
         found = np.where(determined, -scores.sum(axis=0) / information, 0.0)
-        scatter = np.square(batch_sums(scores + by_interval * found)).sum(axis=0)
+        scatter = np.square(batch_sums(scores + by_interval * found, self.batch)).sum(axis=0)
         return found, np.where(determined, np.maximum(information, scatter) / np.square(information), np.inf)
 
     def of(self, some: Sequence[int] | slice) -> TermRegression:
@@ -137,7 +140,7 @@ class TermRegression:
         covariance = np.linalg.inv(np.einsum("wmk,wml->kl", columns, columns))
         values = -covariance @ np.einsum("wmk,wm->k", columns, self.residuals)
         errors = np.einsum("wmk,wm->wk", columns, self.residuals + columns @ values) @ covariance
-        wider = np.sqrt(np.maximum(np.square(batch_sums(errors)).sum(axis=0) / np.diag(covariance), 1.0))
+        wider = np.sqrt(np.maximum(np.square(batch_sums(errors, self.batch)).sum(axis=0) / np.diag(covariance), 1.0))
         return values, covariance * np.outer(wider, wider)
 
     def joint(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
@@ -159,7 +162,7 @@ class TermRegression:
         return -float((own * self.residuals).sum() / (np.square(own).sum() + _TINY))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class TermSet:
     """A term that the model may lack, or two together.
 
@@ -180,7 +183,7 @@ class TermSet:
     covariance: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class CandidateTests:
     """Tests of K candidates at a fit.
 

@@ -2,14 +2,16 @@
 
 A term accelerates the model, as the unmodelled accelerations do, so that its slopes are in the normal equations.  One
 solution of these for all terms gives the residuals' slopes by the coefficients.  Long logs are solved section by
-section, and residuals of neighbouring intervals are gathered, which takes a fraction of the memory.
+section, and a batch of neighbouring intervals is kept as the triangle of its residuals, which takes a fraction of the
+memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import cached_property, lru_cache
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,8 +32,8 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation import GaussNewtonBatch
 
-# Numbers of equations that are solved at once (80 MB, a tenth of a second), and of all residuals (400 MB), at most.
-_MOST, _RESIDUALS = 1e7, 5e7
+# Numbers of equations that are solved at once (80 MB, a tenth of a second), at most; of a section of more.
+_MOST, _SECTION = 1e7, 3e5
 # Factor of the prior of discrepancies that holds them at zero.
 _HELD = 1e-3
 # Part of the information of an interval that is rounding.
@@ -86,46 +88,58 @@ def term_regression(
     prior[intervals.n_p :] *= _HELD
     fit = replace(fit, prior=prior)
     at, n_x = linearize(intervals, fit, weights_of(intervals, fit)), fit.x.shape[1]
-    parts = len(intervals) // len(inertia)
-    pushed = _Pushed(intervals, fit, accelerations, at, intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights))
+    n, parts = len(inertia), len(intervals) // len(inertia)
+    pushed = _Pushed(intervals, fit, accelerations, at)
     sections = _sections(len(intervals), parts, _numbers(fit, accelerations.shape[2]))
     direct, of_s = (np.sum(x, axis=0) for x in zip(*map(pushed.of_shared, sections), strict=True))
-    solved, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
-    rows = _gathered((pushed.residuals(k, sections, solved, s) for k in range(len(sections))), len(inertia), parts)
-    effects, forces = result.of_s.T @ s[:, :-1], list[FloatArray]()
-    for part, z in zip(sections, solved, strict=True):
+    windows, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
+    rows, length = list[FloatArray](), 1 if len(sections) == 1 else round(np.sqrt(n))
+    effects, moved = result.of_s.T @ s[:, :-1], np.empty((n, inertia.shape[1], s.shape[1]))
+    for part, (before, z, after) in zip(sections, _with_neighbours(windows), strict=True):
+        own = slice(part.start // parts, part.stop // parts)
+        found = pushed.residuals(part, z, before, after, s)
+        _gather(rows, found.reshape(-1, parts * found.shape[1], found.shape[2]), own.start, length)
         # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
-        own, z = slice(part.start // parts, part.stop // parts), z.reshape(-1, parts, *z.shape[1:])
+        z = z.reshape(-1, parts, *z.shape[1:])
         z = np.concatenate([z[:, 0, :n_x], z[:, :, n_x:].mean(axis=1)], axis=1)
         effects = effects + np.einsum("wkp,wke->pe", result.of_z[own], z[:, :, :-1], optimize=True)
-        forces.append(inertia[own] @ z[:, n_x:])
-    moved, d = np.concatenate(forces), fit.d.reshape(len(inertia), parts, -1).mean(axis=1)
+        np.matmul(inertia[own], z[:, n_x:], out=moved[own])
+    d = fit.d.reshape(n, parts, -1).mean(axis=1)
     force = (inertia @ d[:, :, None])[:, :, 0] + moved[:, :, -1]
     beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
     more = np.pad(beforehand, ((0, -len(beforehand) % rows[0].shape[1]), (0, 0)))
-    rows.append(more.reshape(-1, *rows[0].shape[1:]))
-    together: FloatArray = np.empty((sum(map(len, rows)), *rows[0].shape[1:]))
-    for end in np.cumsum([len(x) for x in rows]).tolist():
-        some = rows.pop(0)  # of a long log they fill the memory
-        together[end - len(some) : end] = some
+    together = np.concatenate([*rows, more.reshape(-1, *rows[0].shape[1:])])
     left, columns = together[:, :, -1] + together[:, :, -2], together[:, :, :-2]
-    return TermRegression(effects, direct, left, columns, force, moved[:, :, :-1], acts, slopes)
+    batch = None if length == 1 else 1
+    return TermRegression(effects, direct, left, columns, force, moved[:, :, :-1], acts, slopes, batch)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class _Pushed:
-    """A fit that accelerations (W, n_v, K) of K terms push; its normal equations, all and of the measurements alone."""
+    """A fit that accelerations (W, n_v, K) of K terms push, and its normal equations."""
 
     intervals: ShootingIntervals
     fit: Fit
     accelerations: FloatArray
     at: NormalEquations
-    sums: GaussNewtonBatch
 
-    @property
-    def by_d(self) -> FloatArray:
-        """Columns ``(W, n, n_v)`` of the unmodelled accelerations in the information of the measurements."""
-        return self.sums.normal_matrix[:, :, self.fit.x.shape[1] : self.at.right_z.shape[1]]
+    @cached_property
+    def n_measured(self) -> int:
+        """Largest number of measurements of an interval."""
+        return int(self.intervals.known.reshape(len(self.intervals), -1).sum(axis=1).max())
+
+    @cached_property
+    def of_measurements(self) -> Callable[[int, int], GaussNewtonBatch]:
+        """Sums of the measurements of intervals from one to before another; the last ones are kept."""
+        intervals, at = self.intervals, (self.fit.shared, self.fit.x, self.fit.d, self.at.weights)
+        # Without a reference to this object, which would keep its equations until a collection of garbage.
+        return lru_cache(maxsize=1)(lambda *some: intervals.gauss_newton(*at, chosen=np.arange(*some)))
+
+    def by_d(self, part: slice) -> FloatArray:
+        """Columns ``(n, n, n_v)`` of the unmodelled accelerations in the information of the measurements."""
+        return self.of_measurements(part.start, part.stop).normal_matrix[
+            :, :, self.fit.x.shape[1] : self.at.right_z.shape[1]
+        ]
 
     def jumps(self, links: slice) -> tuple[FloatArray, FloatArray]:
         """Change ``(n, n_x, K)`` of the jumps at the ends of some intervals, and that times their precision."""
@@ -137,7 +151,7 @@ class _Pushed:
         """Of some intervals: information (K,) of each coefficient alone, and right-hand sides (n_s, K)."""
         n_x, k = self.fit.x.shape[1], self.at.right_z.shape[1]
         links = slice(part.start, min(part.stop, len(self.at.jumps)))
-        own, by_d, (jumps, force) = self.accelerations[part], self.by_d[part], self.jumps(links)
+        own, by_d, (jumps, force) = self.accelerations[part], self.by_d(part), self.jumps(links)
         direct = (own * (by_d[:, n_x:k] @ own)).sum(axis=(0, 1)) + (jumps * force).sum(axis=(0, 1))
         of_jumps = sum_of_products(self.intervals, self.at.slopes[links, :, k:].swapaxes(1, 2), force, part)
         return direct, of_jumps - sum_of_products(self.intervals, by_d[:, k:], own, part)
@@ -150,7 +164,7 @@ class _Pushed:
         n_x, k, first = self.fit.x.shape[1], self.at.right_z.shape[1], max(part.start - 1, 0)
         links = slice(first, min(part.stop, len(self.at.jumps)))
         found = np.empty((part.stop - part.start, k, self.accelerations.shape[2] + 1))
-        found[:, :, :-1] = -self.by_d[part, :k] @ self.accelerations[part]
+        found[:, :, :-1] = -self.by_d(part)[:, :k] @ self.accelerations[part]
         found[:, :, -1] = self.at.right_z[part]
         _, force = self.jumps(links)
         own = force[part.start - first :]
@@ -159,53 +173,51 @@ class _Pushed:
         found[first + 1 - part.start :][: len(reached), :n_x, :-1] -= reached
         return found
 
-    def residuals(self, i: int, sections: Sequence[slice], solved: Sequence[FloatArray], s: FloatArray) -> FloatArray:
+    def residuals(self, part: slice, z: FloatArray, before: FloatArray, after: FloatArray, s: FloatArray) -> FloatArray:
         """Whitened residuals of a section: slopes by each coefficient, the change by the step, and what the fit leaves.
 
         Of the measurements, of continuity, and of the unmodelled accelerations from their prior.
 
         Parameters
         ----------
-        i : int
-            Of the section.
-        sections : sequence of slice
-        solved, s : sequence of (n, k, K + 1) array, and (n_s, K + 1) array
-            Solutions of each section, and of the shared unknowns.
+        part : slice
+            Intervals of the section.
+        z, before, after, s : (n, k, K + 1), (1, k, K + 1), (0 or 1, k, K + 1) and (n_s, K + 1) array
+            Solutions of the section, of the intervals before and after it, and of the shared unknowns.
 
         Returns
         -------
         (n, m, K + 2) array
         """
-        at, intervals, fit, part, z = self.at, self.intervals, self.fit, sections[i], solved[i]
+        at, intervals, fit = self.at, self.intervals, self.fit
+        sums = self.of_measurements(part.start, part.stop)
         n_x, k, K = fit.x.shape[1], z.shape[1], s.shape[1]
         moved, of_log = z.copy(), of_logs(intervals, s, part)
         moved[:, n_x:, :-1] += self.accelerations[part]
-        n_measured = intervals.known.reshape(len(intervals), -1).sum(axis=1).max()
-        root, residuals = _whitened(self.sums.normal_matrix[part], self.sums.gradient[part], n_measured)
+        root, residuals = _whitened(sums.normal_matrix, sums.gradient, self.n_measured)
         found: FloatArray = np.zeros((len(z), root.shape[1] + k, K + 1))
         measured, ahead, driven = np.split(found, [root.shape[1], root.shape[1] + n_x], axis=1)
         np.matmul(root[:, :, :k], moved, out=measured[:, :, :K])
         measured[:, :, :K] += root[:, :, k:] @ of_log
         measured[:, :, K] = residuals
-        following = np.concatenate([z[1:], *(x[:1] for x in solved[i + 1 : i + 2])])
+        following = np.concatenate([z[1:], after])
         n, links = len(following), slice(part.start, part.start + len(following))
         slopes = at.slopes[links]
         ahead[:n, :, :K] = following[:, :n_x] - slopes[:, :, :k] @ moved[:n] - slopes[:, :, k:] @ of_log[:n]
         ahead[:n, :, K] = at.jumps[links]
         ahead[:n] *= np.sqrt(at.precision[links])[:, :, None]
         rho = np.where(intervals.following[part, None], fit.rho, 0.0)[:, :, None]
-        before = np.concatenate([solved[max(i - 1, 0)][-1:], z[:-1]]), np.concatenate([fit.d[:1], fit.d[:-1]])[part]
-        driven[:, :, :K] = z[:, n_x:] - rho * before[0][:, n_x:]
-        driven[:, :, K] = fit.d[part] - rho[:, :, 0] * before[1]
+        driven[:, :, :K] = z[:, n_x:] - rho * np.concatenate([before, z[:-1]])[:, n_x:]
+        driven[:, :, K] = fit.d[part] - rho[:, :, 0] * np.concatenate([fit.d[:1], fit.d[:-1]])[part]
         driven /= innovation_std(intervals, fit)[part, :, None]
         return found
 
 
 def _sections(n_intervals: int, parts: int, numbers: float) -> list[slice]:
-    """All intervals, if their numbers are few; otherwise sections with a quarter of as many, of whole intervals."""
+    """All intervals, if their numbers are few; otherwise sections of whole intervals."""
     if n_intervals * numbers <= _MOST:
         return [slice(0, n_intervals)]
-    length = parts * max(int(0.25 * _MOST / (parts * numbers)), 1)
+    length = parts * max(int(_SECTION / (parts * numbers)), 1)
     return [slice(k, min(k + length, n_intervals)) for k in range(0, n_intervals, length)]
 
 
@@ -216,27 +228,30 @@ def _numbers(fit: Fit, n_terms: int) -> float:
     return float(n_terms * (n + 2 * k) + n**2)
 
 
-def _gathered(sections: Iterable[FloatArray], n_intervals: int, parts: int) -> list[FloatArray]:
-    """Residuals (W, m, K + 2) of sections, an interval of the estimate in each row.
+def _with_neighbours(sections: Iterator[FloatArray]) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Each section (n, ...) between the last row before it and the first row after it, which the last one lacks."""
+    z = next(sections)
+    before = z[-1:]
+    for after in chain(sections, [z[:0]]):
+        yield before, z, after[:1]
+        before, z = z[-1:], after
 
-    Where these are too many, as few rows of groups of neighbouring intervals, with the same squares and products: the
-    triangle of a QR decomposition.
+
+def _gather(found: list[FloatArray], rows: FloatArray, first: int, length: int) -> None:
+    """Append residuals (n, m, c) of intervals from a first one on; of batches of more than one as few as there may be.
+
+    With the same squares and products: the triangle of a QR decomposition.
     """
-    found, length, first = list[FloatArray](), 0, 0
-    for rows in sections:
-        rows = rows.reshape(len(rows) // parts, -1, rows.shape[2])
-        n = rows.shape[2]
-        if n_intervals * rows[0].size <= _RESIDUALS:
-            found.append(rows)
-            continue
-        length = -(-n_intervals * n**2 // int(_RESIDUALS))
-        for begin, end in pairwise([0, *range(-first % length or length, len(rows), length), len(rows)]):
-            piece = rows[begin:end].reshape(-1, n)
-            if (first + begin) % length:
-                piece = np.concatenate([found.pop(), piece])
-            found.append(np.asarray(np.linalg.qr(piece, mode="r")))
-        first += len(rows)
-    return [np.pad(x, ((0, x.shape[1] - len(x)), (0, 0)))[None] for x in found] if length else found
+    if length == 1:
+        found.append(rows)
+        return
+    c = rows.shape[2]
+    for begin, end in pairwise([0, *range(-first % length or length, len(rows), length), len(rows)]):
+        piece = rows[begin:end].reshape(-1, c)
+        if (first + begin) % length:
+            piece = np.concatenate([found.pop()[0], piece])
+        triangle = np.linalg.qr(piece, mode="r")
+        found.append(np.pad(triangle, ((0, c - len(triangle)), (0, 0)))[None])
 
 
 def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
