@@ -42,7 +42,7 @@ def least_squares(
     n_steps : int
         Largest number of steps.
     tolerance : float, optional
-        Relative decrease of its cost at which a lane has converged.
+        Relative decrease of its cost, or promise of one, at which a lane has converged.
 
     Returns
     -------
@@ -66,6 +66,11 @@ def least_squares(
         scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
         scaled = H / scale[:, :, None] / scale[:, None, :] + damping[active, None, None] * np.eye(z.shape[1])
         step = -np.nan_to_num(solve_definite(scaled, g / scale)) / scale
+        # At a minimum, rounding decides whether a cost falls.
+        promising = -2.0 * (g * step).sum(axis=1) > tolerance * cost[active]
+        active, step = active[promising], step[promising]
+        if not len(active):
+            break
         trial = problem.moved(z[active], step)
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]

@@ -317,8 +317,14 @@ class LocalSearch:
 
     def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
-        fitted = refine_exact if now.exact else refine
-        return replace(now, refinement=fitted(self.settings, intervals, begin, self.prior))
+        if now.exact:
+            old, new = now.intervals, intervals
+            # Inputs that act otherwise move the motion by far more than its scales.
+            near = new.hold == old.hold and set(new.all_errors.kinds) >= set(old.all_errors.kinds)
+            refined = refine_exact(self.settings, intervals, begin, self.prior, goes_on=near)
+        else:
+            refined = refine(self.settings, intervals, begin, self.prior)
+        return replace(now, refinement=refined)
 
     def _better(
         self,

@@ -285,7 +285,13 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
 
 
 def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float = np.inf
+    settings: LoDiransacSettings,
+    intervals: ShootingIntervals,
+    fit: Fit,
+    prior: Prior,
+    rival: float = np.inf,
+    *,
+    goes_on: bool = False,
 ) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
@@ -298,6 +304,8 @@ def refine_exact(
     prior : Prior
     rival : float, optional
         Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
+    goes_on : bool, optional
+        Whether the initial fit is exact: its scales stay as tight as they are.
 
     Returns
     -------
@@ -308,33 +316,39 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    n_p, least = intervals.n_p, _EXACT * prior.tau
-    shared, sizes = fit.shared.copy(), fit.prior.copy()
-    shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
-    tau = _NEARLY_EXACT * prior.tau
-    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-    fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
-    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
+    n_p, anneals = intervals.n_p, not goes_on
+    if anneals:
+        fit = _nearly_exact(intervals, fit, prior)
+    least, jumps = _EXACT * prior.tau if anneals else fit.tau, fit.continuity_std
+    damping, converged, steps = 0.0, False, 0
     at, behind = linearized(intervals, fit), list[float]()
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
-        intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
+        intervals, moved, damping = taken.intervals, taken.fit, taken.damping
         if rival < np.inf:
             behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
-        jumps = (
-            np.clip(unbroken_jumps(at.fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
-        )
+        if anneals and steps == 1:
+            jumps = np.clip(unbroken_jumps(at.fit, taken.solved), negligible_jumps(intervals, least), jumps)
         continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
         settled = bool((tau == at.fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
-        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
+        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(taken.solved.var_p)[:n_p]))
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
+
+
+def _nearly_exact(intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Fit:
+    """A fit without unmodelled accelerations and discrepancies, whose scales still admit some."""
+    n_p, tau = intervals.n_p, _NEARLY_EXACT * prior.tau
+    shared, sizes = fit.shared.copy(), fit.prior.copy()
+    shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
+    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
+    return with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
 
 
 def _is_lost(intervals: ShootingIntervals, behind: Sequence[float]) -> bool:
