@@ -65,13 +65,11 @@ def least_squares(
         H, g = matrix[active], gradient[active]
         scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
         scaled = H / scale[:, :, None] / scale[:, None, :] + damping[active, None, None] * np.eye(z.shape[1])
-        step = -np.nan_to_num(solve_definite(scaled, g / scale)) / scale
+        back = solve_definite(scaled, g / scale) / scale
         # At a minimum, rounding decides whether a cost falls.
-        promising = -2.0 * (g * step).sum(axis=1) > tolerance * cost[active]
-        active, step = active[promising], step[promising]
-        if not len(active):
-            break
-        trial = problem.moved(z[active], step)
+        promising = ~(2.0 * (g * back).sum(axis=1) <= tolerance * cost[active])
+        active = active[promising]
+        trial = problem.moved(z[active], -np.nan_to_num(back[promising]))
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]
         settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])

@@ -244,27 +244,19 @@ class Arbiter:
         return ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
 
     @cached_property
-    def _measured(self) -> FloatArray:
-        """Samples ``(K, n_after, n_s)`` that count; NaN in place of others."""
-        one = self.segments
-        return np.where(self._known, one.intervals.measured[one.rows[:, self._after]][:, :, one.columns], np.nan)
-
-    @cached_property
-    def _spread(self) -> FloatArray:
-        """Spread ``(n_s,)`` of what counts."""
-        flat = self._measured.reshape(-1, self._known.shape[2])
-        spread = _root_mean_squares(flat - _medians(flat))
-        return np.where(spread > 0.0, spread, 1.0)
-
-    @cached_property
-    def _no_change(self) -> list[FloatArray]:
-        """RMS errors ``(n_s,)`` of the prediction that nothing changes, by horizon."""
+    def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
+        """Spread ``(n_s,)`` of what counts, and RMS errors of the prediction that nothing changes, by horizon."""
         one, few = self.segments, max(1, min(3, self.n_before))
-        seen, before = one.intervals.sampled & self.inlying, one.rows[:, self.n_before - few : self.n_before]
-        last = np.where(seen, one.intervals.measured, np.nan)[before][:, :, one.columns]
-        apart = self._measured - _medians(last)[:, None]
-        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, apart.shape[2])) for n in self._n_rows]
-        return [np.where(size > 0.0, size, self._spread) for size in sizes]
+        before, after = one.rows[:, self.n_before - few : self.n_before], one.rows[:, self._after]
+        measured, seen = one.intervals.measured, one.intervals.sampled & self.inlying
+        last = np.where(seen, measured, np.nan)[before][:, :, one.columns]
+        y = np.where(self._known, measured[after][:, :, one.columns], np.nan)
+        flat = y.reshape(-1, y.shape[2])
+        spread = _root_mean_squares(flat - _medians(flat))
+        spread = np.where(spread > 0.0, spread, 1.0)
+        apart = y - _medians(last)[:, None]
+        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, y.shape[2])) for n in self._n_rows]
+        return spread, [np.where(size > 0.0, size, spread) for size in sizes]
 
     def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
         """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
@@ -289,7 +281,7 @@ class Arbiter:
             nearest[own] = np.minimum(nearest[own], np.abs(e[own]))
         far = self._known & (nearest > OUTLYING * np.nan_to_num(_scale(nearest, self._known), nan=np.inf))
         fair, n_lost = self, 0
-        while (lost := far & (self.outliers_of_fit | (nearest > fair._spread))).sum() > n_lost:
+        while (lost := far & (self.outliers_of_fit | (nearest > fair._sizes[0]))).sum() > n_lost:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
@@ -302,7 +294,7 @@ class Arbiter:
 
     def _scores(self, errors: FloatArray) -> Scores:
         """Scores of errors ``(K, n_after, n_s)``."""
-        spread, no_change = self._spread, self._no_change
+        spread, no_change = self._sizes
         losses, found = list[FloatArray](), list[FloatArray]()
         squares = np.where(self._known, np.square(errors), 0.0)
         for n, count, size in zip(self._n_rows, self._counts, no_change, strict=True):
@@ -346,8 +338,7 @@ def _means(values: FloatArray) -> FloatArray:
 def _medians(values: FloatArray) -> FloatArray:
     """Medians ``(..., n_s)`` of the finite numbers of each column ``(..., n, n_s)``; NaN where there are none."""
     known = np.isfinite(values)
-    ordered = np.sort(np.where(known, values, np.nan), axis=-2)
-    count = known.sum(axis=-2, keepdims=True)
+    ordered, count = np.sort(np.where(known, values, np.nan), axis=-2), known.sum(axis=-2, keepdims=True)
     pair = (np.take_along_axis(ordered, np.maximum(k, 0), -2) for k in ((count - 1) // 2, count // 2))
     return np.where(count > 0, 0.5 * sum(pair), np.nan)[..., 0, :]
 

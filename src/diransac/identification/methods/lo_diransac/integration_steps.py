@@ -48,20 +48,32 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
     finest = replace(intervals, substeps=most)
     accurate = with_residuals(finest, fit)
     at = linearize(intervals, fit, weights_of(intervals, fit))
-    for n in _FEW:
-        if n >= most:
-            break
+    for n in (x for x in _FEW if x < most):
         other = replace(intervals, substeps=n)
         changed = with_residuals(other, fit)
-        step, cost = _answer(intervals, at, accurate, changed)
+        step, cost = answer(intervals, at, accurate, changed)
         change = np.abs(step.step_p) / np.sqrt(np.diag(step.var_p))
         if (change[: intervals.n_p] < _NEGLIGIBLE).all() and abs(cost) < _NEGLIGIBLE_COST:
             return other, after_step(other, fit, step)
     return finest, accurate
 
 
-def _answer(intervals: ShootingIntervals, at: NormalEquations, fit: Fit, changed: Fit) -> tuple[Factored, float]:
-    """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats."""
+def answer(intervals: ShootingIntervals, at: NormalEquations, fit: Fit, changed: Fit) -> tuple[Factored, float]:
+    """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    at : NormalEquations
+    fit : Fit
+        At its optimum.
+    changed : Fit
+        The same with other residuals and ends.
+
+    Returns
+    -------
+    Factored, float
+    """
     own = changed.residuals - fit.residuals
     jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - changed.ends[:-1], 0.0)
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, at.weights, directions=[own], normal_matrix=False)

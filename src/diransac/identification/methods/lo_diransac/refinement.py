@@ -285,13 +285,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
 
 
 def refine_exact(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    fit: Fit,
-    prior: Prior,
-    rival: float = np.inf,
-    *,
-    goes_on: bool = False,
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float | None = None
 ) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
@@ -304,8 +298,7 @@ def refine_exact(
     prior : Prior
     rival : float, optional
         Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
-    goes_on : bool, optional
-        Whether the initial fit is exact: its scales stay as tight as they are.
+        None: the initial fit is exact, and its scales stay as tight as they are.
 
     Returns
     -------
@@ -316,23 +309,25 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    n_p, anneals = intervals.n_p, not goes_on
-    if anneals:
-        fit = _nearly_exact(intervals, fit, prior)
-    least, jumps = _EXACT * prior.tau if anneals else fit.tau, fit.continuity_std
-    damping, converged, steps = 0.0, False, 0
-    at, behind = linearized(intervals, fit), list[float]()
+    n_p, least, jumps = intervals.n_p, fit.tau, fit.continuity_std
+    if rival is not None:
+        shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
+        shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
+        least, jumps = _EXACT * prior.tau, negligible_jumps(intervals, tau)
+        fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
+        fit = with_residuals(intervals, replace(fit, continuity_std=jumps))
+    damping, converged, steps, at, behind = 0.0, False, 0, linearized(intervals, fit), list[float]()
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
         intervals, moved, damping = taken.intervals, taken.fit, taken.damping
-        if rival < np.inf:
+        if rival is not None:
             behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
         inlying = moved.noise.inlying(moved.residuals, intervals.known)
         noise = moved.noise.updated(moved.residuals, intervals.known, inlying, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
-        if anneals and steps == 1:
+        if rival is not None and steps == 1:
             jumps = np.clip(unbroken_jumps(at.fit, taken.solved), negligible_jumps(intervals, least), jumps)
         continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
@@ -340,15 +335,6 @@ def refine_exact(
         converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(taken.solved.var_p)[:n_p]))
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
-
-
-def _nearly_exact(intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Fit:
-    """A fit without unmodelled accelerations and discrepancies, whose scales still admit some."""
-    n_p, tau = intervals.n_p, _NEARLY_EXACT * prior.tau
-    shared, sizes = fit.shared.copy(), fit.prior.copy()
-    shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
-    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-    return with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
 
 
 def _is_lost(intervals: ShootingIntervals, behind: Sequence[float]) -> bool:
