@@ -59,8 +59,6 @@ def least_squares(
     cost, gradient, matrix = problem.linearized(z, np.arange(len(z)))
     active = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_steps):
-        if not len(active):
-            break
         check_time()
         H, g = matrix[active], gradient[active]
         scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
@@ -69,6 +67,8 @@ def least_squares(
         # At a minimum, rounding decides whether a cost falls.
         promising = ~(2.0 * (g * back).sum(axis=1) <= tolerance * cost[active])
         active = active[promising]
+        if not len(active):
+            break
         trial = problem.moved(z[active], -np.nan_to_num(back[promising]))
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]
