@@ -520,6 +520,9 @@ def test_a_late_recording_of_the_inputs_is_an_unknown_of_the_fit():
     assert found.intervals.all_errors.sizes[delay] == pytest.approx(2.4, abs=0.05)
     assert found.fit.shared[:3] == pytest.approx(TRUTH, rel=0.02)
     assert found.cost < refine_exact(dr.LoDiransac(), early, begin, prior, 1e9).cost - 100.0
+    again = refine_exact(dr.LoDiransac(), found.intervals, found.fit, prior)
+    assert again.steps <= 2  # scales stay as they are
+    assert again.cost == pytest.approx(found.cost, abs=1.0)
 
 
 # ---------------------------------------------------------------------- projection
