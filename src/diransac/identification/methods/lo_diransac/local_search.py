@@ -293,12 +293,12 @@ class LocalSearch:
     ) -> list[ShootingIntervals]:
         """Other timings of all inputs: what an error suggests, a lag instead of a delay, or another hold."""
         intervals, (delay, lag) = best.intervals, (best.intervals.all_inputs(what) for what in LATE)
-        sizes = intervals.all_errors.sizes
-        late = sizes.get(delay, 0.0) + sizes.get(lag, 0.0) + (error.size if error else 0.0)
+        sizes, others = intervals.all_errors.sizes, []
+        now = sizes.get(delay, 0.0)
+        late = now + sizes.get(lag, 0.0) + (error.size if error else 0.0)
         free_hold &= intervals.hold == "zero-order"
-        is_first, others = delay not in sizes and lag not in sizes, []
-        if is_first and delay in sought and round(late) != 0:
-            others.append(intervals.with_input_error(delay, round(late)))
+        if delay in sought and round(late) != now:
+            others.append(intervals.with_input_error(delay, round(late) - now))
         punctual = intervals.without_error(delay)
         if lag in sought and lag not in sizes and late > SHORTEST_LAG:
             hold = "linear" if free_hold else intervals.hold
@@ -306,7 +306,7 @@ class LocalSearch:
         if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
             others += [replace(punctual, hold=hold) for hold in ("linear", "smooth")]
         found = [intervals.with_input_error(error.kind, error.size)] if error else []
-        return found + [x for x in others if is_first or self._promises(best, x)]
+        return found + [x for x in others if not {delay, lag} & sizes.keys() or self._promises(best, x)]
 
     def _promises(self, now: Explanation, other: ShootingIntervals) -> bool:
         """True unless a fit is less likely with another timing than with its own, at the optimum of which it is.
