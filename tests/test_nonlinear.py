@@ -8,6 +8,7 @@ import pytest
 import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.errors import IdentificationError, ModelError
+from diransac.identification.regression.multistart import least_squares
 from diransac.model import Parameter
 from diransac.model.library import builtin
 from simulated import MACHINES, as_log, flight, with_outliers
@@ -196,3 +197,29 @@ def test_estimate_on_its_bound_is_named_and_has_no_interval(tmp_path):
 def test_value_fixed_by_equal_bounds_is_not_on_a_bound():
     fixed = hanging_mass(parameters=hanging_mass().parameters | {"c": Parameter("N m s", lower=0.06, upper=0.06)})
     assert dr.identify(fixed, swing(), "nls").on_bounds == ()
+
+
+class Parabolas:
+    """Lanes with minima at whole numbers, of a cost that rounds."""
+
+    def __init__(self):
+        self.tried = []
+
+    def moved(self, now, step):
+        """Unknowns after a step."""
+        return now + step
+
+    def linearized(self, z, lanes):
+        """Cost, half of its gradient, and half of its curvature; which lanes asked is kept."""
+        self.tried.append(lanes.tolist())
+        away = z - lanes[:, None]
+        return 1.0 + np.square(away).sum(axis=1), away, np.tile(np.eye(2), (len(z), 1, 1))
+
+
+def test_lanes_end_where_a_step_promises_nothing():
+    problem, begin = Parabolas(), np.arange(3.0)[:, None] + [[0.0, 0.0], [3.0, -1.0], [0.0, 1e-6]]
+    found, cost = least_squares(problem, begin, 15)
+    assert problem.tried[:2] == [[0, 1, 2], [1]]
+    assert len(problem.tried) < 8
+    np.testing.assert_allclose(found, np.arange(3.0)[:, None] + np.zeros(2), atol=1e-5)
+    assert cost == pytest.approx(1.0, abs=1e-9)

@@ -42,7 +42,7 @@ def least_squares(
     n_steps : int
         Largest number of steps.
     tolerance : float, optional
-        Relative decrease of its cost at which a lane has converged.
+        Relative decrease of its cost, or promise of one, at which a lane has converged.
 
     Returns
     -------
@@ -59,14 +59,17 @@ def least_squares(
     cost, gradient, matrix = problem.linearized(z, np.arange(len(z)))
     active = np.flatnonzero(np.isfinite(cost))
     for _ in range(n_steps):
-        if not len(active):
-            break
         check_time()
         H, g = matrix[active], gradient[active]
         scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
         scaled = H / scale[:, :, None] / scale[:, None, :] + damping[active, None, None] * np.eye(z.shape[1])
-        step = -np.nan_to_num(solve_definite(scaled, g / scale)) / scale
-        trial = problem.moved(z[active], step)
+        back = solve_definite(scaled, g / scale) / scale
+        # At a minimum, rounding decides whether a cost falls.
+        promising = ~(2.0 * (g * back).sum(axis=1) <= tolerance * cost[active])
+        active = active[promising]
+        if not len(active):
+            break
+        trial = problem.moved(z[active], -np.nan_to_num(back[promising]))
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]
         settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])

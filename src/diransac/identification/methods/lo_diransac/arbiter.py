@@ -254,7 +254,7 @@ class Arbiter:
         flat = y.reshape(-1, y.shape[2])
         spread = _root_mean_squares(flat - _medians(flat))
         spread = np.where(spread > 0.0, spread, 1.0)
-        apart = y - np.stack([_medians(x) for x in last])[:, None]
+        apart = y - _medians(last)[:, None]
         sizes = [_root_mean_squares(apart[:, :n].reshape(-1, y.shape[2])) for n in self._n_rows]
         return spread, [np.where(size > 0.0, size, spread) for size in sizes]
 
@@ -336,11 +336,11 @@ def _means(values: FloatArray) -> FloatArray:
 
 
 def _medians(values: FloatArray) -> FloatArray:
-    """Medians ``(n,)`` of the finite numbers of each column; NaN where there are none."""
+    """Medians ``(..., n_s)`` of the finite numbers of each column ``(..., n, n_s)``; NaN where there are none."""
     known = np.isfinite(values)
-    ordered, count = np.sort(np.where(known, values, np.nan), axis=0), known.sum(axis=0)
-    middle = (ordered[np.maximum(k, 0), np.arange(len(count))] for k in ((count - 1) // 2, count // 2))
-    return np.where(count > 0, 0.5 * sum(middle), np.nan)
+    ordered, count = np.sort(np.where(known, values, np.nan), axis=-2), known.sum(axis=-2, keepdims=True)
+    pair = (np.take_along_axis(ordered, np.maximum(k, 0), -2) for k in ((count - 1) // 2, count // 2))
+    return np.where(count > 0, 0.5 * sum(pair), np.nan)[..., 0, :]
 
 
 def _predicted(segments: Segments) -> BoolArray:

@@ -49,21 +49,33 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
     finest = replace(intervals, substeps=most)
     accurate = fit if intervals.substeps == most else with_residuals(finest, fit)
     at = linearize(intervals, fit, weights_of(intervals, fit))
-    for n in _FEW:
-        if n >= most:
-            break
+    for n in (x for x in _FEW if x < most):
         other = replace(intervals, substeps=n)
-        step, cost = _answer(intervals, at, accurate, other)
+        step, cost = answer(intervals, at, accurate, other)
         change = np.abs(step.step_p) / np.sqrt(np.diag(step.var_p))
         if (change[: intervals.n_p] < _NEGLIGIBLE).all() and abs(cost) < _NEGLIGIBLE_COST:
             return other, after_step(other, fit, step)
     return finest, accurate
 
 
-def _answer(
+def answer(
     intervals: ShootingIntervals, at: NormalEquations, fit: Fit, other: ShootingIntervals
 ) -> tuple[Factored, float]:
-    """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats."""
+    """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    at : NormalEquations
+    fit : Fit
+        At its optimum.
+    other : ShootingIntervals
+        Those that simulate the other residuals and ends.
+
+    Returns
+    -------
+    Factored, float
+    """
     own, ends = other.simulated(fit.shared, fit.x, fit.d)
     own -= fit.residuals
     jumps = np.where(intervals.linked[:, None], fit.ends[:-1] - ends[:-1], 0.0)

@@ -21,7 +21,8 @@ from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
-from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
+from diransac.identification.methods.lo_diransac.gauss_newton import linearized
+from diransac.identification.methods.lo_diransac.integration_steps import answer, with_fewest_steps
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
@@ -283,7 +284,8 @@ class LocalSearch:
                 share = _EXPLAINS_DRIFT if error.kind.what == "drift" else _EXPLAINS
                 lag = replace(error, kind=replace(error.kind, what="lag"))
                 tried = [error, lag] if lag.kind in sought and error.size > SHORTEST_LAG else [error]
-                found += [self._better(best, [self._with_errors(best, [x])], share, of_one=True) for x in tried]
+                moved = [self._moved(best, with_errors(best.intervals, best.refinement.fit, [x])) for x in tried]
+                found += [self._better(best, [x], share, of_one=True) for x in moved]
         return [x for x in found if x is not best]
 
     def _timings(
@@ -291,34 +293,42 @@ class LocalSearch:
     ) -> list[ShootingIntervals]:
         """Other timings of all inputs: what an error suggests, a lag instead of a delay, or another hold."""
         intervals, (delay, lag) = best.intervals, (best.intervals.all_inputs(what) for what in LATE)
-        sizes, found = intervals.all_errors.sizes, []
+        sizes, others = intervals.all_errors.sizes, []
         now = sizes.get(delay, 0.0)
         late = now + sizes.get(lag, 0.0) + (error.size if error else 0.0)
         free_hold &= intervals.hold == "zero-order"
-        if error is not None:
-            found.append(intervals.with_input_error(error.kind, error.size))
         if delay in sought and round(late) != now:
-            found.append(intervals.with_input_error(delay, round(late) - now))
+            others.append(intervals.with_input_error(delay, round(late) - now))
         punctual = intervals.without_error(delay)
         if lag in sought and lag not in sizes and late > SHORTEST_LAG:
             hold = "linear" if free_hold else intervals.hold
-            found.append(replace(punctual.with_input_error(lag, late), hold=hold))
+            others.append(replace(punctual.with_input_error(lag, late), hold=hold))
         if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
-            found += [replace(punctual, hold=hold) for hold in ("linear", "smooth")]
-        return found
+            others += [replace(punctual, hold=hold) for hold in ("linear", "smooth")]
+        found = [intervals.with_input_error(error.kind, error.size)] if error else []
+        return found + [x for x in others if not {delay, lag} & sizes.keys() or self._promises(best, x)]
+
+    def _promises(self, now: Explanation, other: ShootingIntervals) -> bool:
+        """True unless a fit is less likely with another timing than with its own, at the optimum of which it is.
+
+        To first order, after the step that answers the change of the simulations.
+        """
+        own, fit, at = now.intervals, now.refinement.fit, linearized(now.intervals, now.refinement.fit).of_fit
+        step, change = answer(own, at, fit, other)
+        return not change - (at.right_z * step.step_z).sum() - at.right_s @ step.step_p > AS_LIKELY
 
     def _moved(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
         """The explanation with other inputs, and the same freedom."""
         return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
-    def _with_errors(self, now: Explanation, errors: Sequence[RecordingError]) -> Explanation:
-        """The explanation with more errors, with the same freedom."""
-        return self._moved(now, with_errors(now.intervals, now.refinement.fit, errors))
-
     def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
-        fitted = refine_exact if now.exact else refine
-        return replace(now, refinement=fitted(self.settings, intervals, begin, self.prior))
+        if not now.exact:
+            return replace(now, refinement=refine(self.settings, intervals, begin, self.prior))
+        kept = set(intervals.all_errors.kinds) >= set(now.intervals.all_errors.kinds)
+        # Inputs that act otherwise move the motion by far more than its scales.
+        rival = None if kept and intervals.hold == now.intervals.hold else now.cost
+        return replace(now, refinement=refine_exact(self.settings, intervals, begin, self.prior, rival))
 
     def _better(
         self,
@@ -369,7 +379,7 @@ class LocalSearch:
         if exact is not None and exact.cost < flexible.cost:
             return exact
         while self.settings.model_error and (parts := fewest_parts(flexible.intervals.length)):
-            finer = self._split(flexible, parts)
+            finer = self._optimised(flexible, *split(flexible.intervals, flexible.refinement.fit, parts))
             if finer.cost > flexible.cost - AS_LIKELY:
                 break
             flexible = finer
@@ -401,10 +411,6 @@ class LocalSearch:
         except np.linalg.LinAlgError:
             return None
         return replace(rival, refinement=refined, exact=True)
-
-    def _split(self, coarse: Explanation, parts: int) -> Explanation:
-        """The fit with unmodelled accelerations that vary faster."""
-        return self._optimised(coarse, *split(coarse.intervals, coarse.refinement.fit, parts))
 
 
 def fewest_parts(length: int) -> int:

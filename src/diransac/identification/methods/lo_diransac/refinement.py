@@ -287,7 +287,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
 
 
 def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float = np.inf
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float | None = None
 ) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
@@ -300,6 +300,7 @@ def refine_exact(
     prior : Prior
     rival : float, optional
         Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
+        None: the initial fit is exact, and its scales stay as tight as they are.
 
     Returns
     -------
@@ -310,32 +311,31 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    n_p, least = intervals.n_p, _EXACT * prior.tau
-    shared, sizes = fit.shared.copy(), fit.prior.copy()
-    shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
-    tau = _NEARLY_EXACT * prior.tau
-    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-    fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
-    damping, converged, steps, jumps = 0.0, False, 0, fit.continuity_std
-    at, behind = linearized(intervals, fit), list[float]()
+    n_p, least, jumps = intervals.n_p, fit.tau, fit.continuity_std
+    if rival is not None:
+        shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
+        shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
+        least, jumps = _EXACT * prior.tau, negligible_jumps(intervals, tau)
+        fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
+        fit = with_residuals(intervals, replace(fit, continuity_std=jumps))
+    damping, converged, steps, at, behind = 0.0, False, 0, linearized(intervals, fit), list[float]()
     del fit
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
-        intervals, moved, solved, damping = taken.intervals, taken.fit, taken.solved, taken.damping
-        if rival < np.inf:
+        intervals, moved, damping = taken.intervals, taken.fit, taken.damping
+        if rival is not None:
             behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
         noise = moved.noise.updated(moved.residuals, intervals.known, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
-        jumps = (
-            np.clip(unbroken_jumps(at.fit, solved), negligible_jumps(intervals, least), jumps) if steps == 1 else jumps
-        )
+        if rival is not None and steps == 1:
+            jumps = np.clip(unbroken_jumps(at.fit, taken.solved), negligible_jumps(intervals, least), jumps)
         continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
         settled = bool((tau == at.fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
-        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(solved.var_p)[:n_p]))
-        del at, taken, solved, moved
+        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(taken.solved.var_p)[:n_p]))
+        del at, taken, moved
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 

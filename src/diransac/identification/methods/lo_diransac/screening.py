@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, robust_std
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
-
-if TYPE_CHECKING:
-    pass
 
 # Samples that a window has at least.
 _FEWEST = 5
