@@ -329,12 +329,14 @@ class _Run:
         noise, e, expected = self._noise, linear.errors, linear.variance
         wide = np.sqrt(1.0 + expected / np.square(noise.sigma))
         inlying = noise.inlying(e / wide, known)
-        weights, before = inlying / np.square(noise.sigma), self.contradicts & bool(one.following[w])
+        weights, n_samples = inlying / np.square(noise.sigma), float(inlying.sum())
+        before = self.contradicts & bool(one.following[w])
         self.contradicts = self.contradicting(inlying, known)
         self.is_lost = bool((self.contradicts & before).any())
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
-        update = self.updated(w, state, belief, linear, weights)
-        self._count(w, update, belief, float(inlying.sum()))
+        more = Update.of(belief, linear, weights).noise_over(n_samples)
+        update = self.updated(w, state, belief, linear, weights / max(more, 1.0))
+        self._count(w, update, belief, n_samples)
         self.states[w] = state + update.moved
         self.errors[rows, columns] = np.where(known, e, 0.0)
         self.expected[rows, columns] = expected
@@ -376,8 +378,9 @@ class _Run:
         """Add an interval's contributions."""
         n_q = self.predictor.intervals.model.n_q
         self.age = self.age + 1 if self.predictor.intervals.following[w] and not self.is_lost else 0
-        told, self.scores[w] = update.told(n_samples)
-        self.information += told
+        share = 1.0 / max(update.noise_over(n_samples), 1.0)
+        self.information += share * update.information
+        self.scores[w] = share * update.score
         if self.age < _BEGINNING:
             return
         self.jumps[w] = update.moved

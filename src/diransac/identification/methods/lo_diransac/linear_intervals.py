@@ -212,8 +212,8 @@ class Update:
             Belief(end_half @ end_half.T, linear.end_of_parameters - end_of_unknown @ slopes),
         )
 
-    def told(self, n_samples: float) -> tuple[FloatArray, FloatArray]:
-        """Information ``(n, n)`` and score ``(n,)`` where the interval has as much noise as its samples show.
+    def noise_over(self, n_samples: float) -> float:
+        """Noise that the interval's samples show, over that with which they were weighted; squares.
 
         Where a contact is not as slopes tell, all samples are wrong together, and more than by their noise.
 
@@ -226,5 +226,4 @@ class Update:
         ----------
         Lange, Little, Taylor 1989 (a scale for each group of samples).
         """
-        share = min(1.0, n_samples / max(self.misfit, TINY))
-        return share * self.information, share * self.score
+        return self.misfit / max(n_samples, TINY)
