@@ -1,43 +1,10 @@
-"""Sums of one-interval predictions: what a single interval may tell."""
+"""One-interval predictions: linear models of an interval, and what its samples tell."""
 
 import numpy as np
 import pytest
 
-from diransac.identification.methods.lo_diransac.following import bounded_influence
 from diransac.identification.methods.lo_diransac.linear_intervals import Belief, LinearInterval, Update
 from diransac.identification.methods.lo_diransac.prediction_error import is_worse, with_widths
-
-
-def intervals_of(n: int = 200) -> np.ndarray:
-    """Information of intervals on four parameters, of different sizes."""
-    rng = np.random.default_rng(0)
-    slopes = rng.normal(size=(n, 6, 4)) * [1.0, 10.0, 0.1, 3.0]
-    return slopes.swapaxes(1, 2) @ slopes
-
-
-def test_intervals_that_tell_alike_keep_their_weights():
-    assert (bounded_influence(intervals_of()) == 1.0).all()
-
-
-@pytest.mark.parametrize("steep", [[80], [79, 80]])
-def test_a_contact_that_is_about_to_change_does_not_outweigh_the_log(steep: list[int]):
-    ordinary = intervals_of()
-    information = ordinary.copy()
-    information[steep] += 1e6 * np.outer([1.0, -5.0, 0.2, 1.0], [1.0, -5.0, 0.2, 1.0])
-    weights = bounded_influence(information)
-    assert (weights[steep] < 1e-2).all()
-    assert (np.delete(weights, steep) == 1.0).all()
-    with_it = np.linalg.inv(np.einsum("w,wij->ij", weights, information))
-    without = np.linalg.inv(ordinary.sum(axis=0))
-    assert np.sqrt(np.diag(without) / np.diag(with_it)).max() < 1.25
-    free = np.linalg.inv(information.sum(axis=0))
-    assert np.sqrt(np.diag(without) / np.diag(free)).max() > 1.25
-
-
-def test_intervals_without_samples_tell_nothing():
-    information = intervals_of()
-    information[20:40] = 0.0
-    assert np.isfinite(bounded_influence(information)).all()
 
 
 def test_losses_differ_where_most_intervals_agree_that_they_do():
@@ -126,6 +93,18 @@ def test_an_update_is_that_of_bayes_with_what_slopes_leave_as_noise():
     np.testing.assert_allclose(update.end, linear.end - end @ unknown.T @ S @ linear.errors.ravel())
     covariance = end @ (np.eye(2 * N_X) - unknown.T @ S @ unknown) @ end.T
     np.testing.assert_allclose(update.belief_of_end.covariance, covariance, atol=1e-9)
+
+
+def test_samples_that_are_wrong_together_show_more_noise():
+    belief, rng = belief_of(4)[0], np.random.default_rng(5)
+    J, F = rng.normal(size=(400, 1, N_X + N_P)), rng.normal(size=(N_X, N_X + N_P))
+    noise, weights = rng.standard_normal((400, 1)), np.full((400, 1), 100.0)
+    noise *= 0.1 / np.sqrt(np.mean(np.square(noise)))
+    shown = []
+    for error in (0.5 * noise, noise, 10.0 * noise, noise + 1.0):
+        linear = LinearInterval.local(belief, N_Q, (error, J), (np.zeros(N_X), F))
+        shown.append(Update.of(belief, linear, weights).noise_over(400.0))
+    assert shown == pytest.approx([0.25, 1.0, 100.0, 101.0], rel=0.1)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 1.0])

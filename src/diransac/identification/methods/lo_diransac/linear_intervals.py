@@ -166,6 +166,8 @@ class Update:
         Twice the cost of the change by what was known before.
     information, score : (n, n) and (n,) array
         Contributions to those of the parameters.
+    misfit : float
+        Sum of the squares of the whitened errors before it; in the mean, the number of samples.
     residuals : (n_rows, n_s) array
         Errors after it.
     end : (n_x,) array
@@ -178,6 +180,7 @@ class Update:
     prior: float
     information: FloatArray
     score: FloatArray
+    misfit: float
     residuals: FloatArray
     end: FloatArray
     belief_of_end: Belief
@@ -203,7 +206,24 @@ class Update:
             float(np.square(moved).sum()),
             left[:, :-1].T @ left[:, :-1],
             left[:, :-1].T @ left[:, -1],
+            float(np.square(left[:, -1]).sum()),
             linear.errors + (of_unknown @ moved[:, 0]).reshape(linear.errors.shape),
             linear.end + end_of_unknown @ moved[:, 0],
             Belief(end_half @ end_half.T, linear.end_of_parameters - end_of_unknown @ slopes),
         )
+
+    def noise_over(self, n_samples: float) -> float:
+        """Noise that the interval's samples show, over that with which they were weighted; squares.
+
+        Where a contact is not as slopes tell, all samples are wrong together, and more than by their noise.
+
+        Parameters
+        ----------
+        n_samples : float
+            Number of samples that are no outliers.
+
+        References
+        ----------
+        Lange, Little, Taylor 1989 (a scale for each group of samples).
+        """
+        return self.misfit / max(n_samples, TINY)
