@@ -334,8 +334,7 @@ class _Run:
         self.contradicts = self.contradicting(inlying, known)
         self.is_lost = bool((self.contradicts & before).any())
         self.losses[w] = float((noise.negative_log_likelihood(e / wide, known) + known * np.log(wide)).sum())
-        more = Update.of(belief, linear, weights).noise_over(n_samples)
-        update = self.updated(w, state, belief, linear, weights / max(more, 1.0))
+        update = self.updated(w, state, belief, linear, weights)
         self._count(w, update, belief, n_samples)
         self.states[w] = state + update.moved
         self.errors[rows, columns] = np.where(known, e, 0.0)
