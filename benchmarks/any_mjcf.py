@@ -93,7 +93,7 @@ def measured(path: Path, seed: int, seconds: float) -> dict[str, Any]:
         log = recorded(rng, exact) | dict(zip(model.inputs, inputs.T, strict=True))
         begin = time.process_time()
         result = dr.identify(model, dr.Log.from_arrays(dt * np.arange(len(states)), log))
-    except dr.DiransacError as error:
+    except (dr.DiransacError, ValueError) as error:
         return row | {"refused": str(error)}
     intervals = result.intervals(0.95)
     values = {mask: (truth[mask], nominal[mask], result.parameters[mask], *intervals[mask]) for mask in places}
@@ -117,14 +117,12 @@ def line(row: Mapping[str, Any]) -> str:
 def main() -> None:
     """Measure, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--seeds", default="1:2")
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    print(
-        "| file | seed | intervals that hold | known to half | their error, median, largest, % | verdict | s |"
-    )
+    print("| file | seed | intervals that hold | known to half | their error, median, largest, % | verdict | s |")
     print("|---|--:|--:|--:|--:|---|--:|")
     for path in options.files:
         for seed in range(*map(int, options.seeds.split(":"))):

@@ -279,7 +279,7 @@ class MujocoRollouts(Simulator):
             series[:, :, n_x + model.n_v + sensor] += value
         # MuJoCo repeats the last state after a warning.
         still = (state[:, 1:, : model.n_q] == state[:, :-1, : model.n_q]).all(axis=2)
-        moving = (np.abs(state[:, 1:, model.n_q :]) > 1e-6).any(axis=2)
+        moving = (np.abs(state[:, 1:, model.n_q : model.n_q + model.compiled.nv]) > 1e-6).any(axis=2)
         lost = (still & moving).any(axis=1) | ~(np.abs(state) < _DIVERGED).all(axis=(1, 2))
         series[lost] = np.nan
         ends = state[:, -1].copy()

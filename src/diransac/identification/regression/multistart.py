@@ -64,8 +64,9 @@ def least_squares(
         scale = np.sqrt(np.einsum("kii->ki", H)) + 1e-300
         scaled = H / scale[:, :, None] / scale[:, None, :] + damping[active, None, None] * np.eye(z.shape[1])
         back = solve_definite(scaled, g / scale) / scale
-        # At a minimum, rounding decides whether a cost falls.
-        promising = ~(2.0 * (g * back).sum(axis=1) <= tolerance * cost[active])
+        # At a minimum, rounding decides whether a cost falls.  A damped step promises less.
+        promises = (1.0 + damping[active]) * (g * back).sum(axis=1)
+        promising = ~(2.0 * promises <= tolerance * cost[active])
         active = active[promising]
         if not len(active):
             break

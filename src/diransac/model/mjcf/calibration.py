@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _COMMON = (
     "name", "class", "group", "cranklength", "joint", "jointinparent", "tendon", "slidersite", "cranksite", "site",
-    "refsite", "body", "lengthrange", "actdim", "actearly", "nsample", "interp", "delay",
+    "refsite", "body", "damping", "armature", "user", "actdim", "nsample", "interp", "delay",
 )  # fmt: skip
 """Attributes that actuators of all kinds have, but for limits."""
 _FAR, _FIXED = 3.0, 1e-3
@@ -79,6 +79,11 @@ def calibrated_text(
             continue
         for kind, name in unknown.elements:
             _set(document, compiled, unknown, kind, name)
+    if b"dampratio" in document.source:  # another mass, too, would change what MuJoCo makes of it
+        for name in {compiled.actuator(k).name for k in range(compiled.nu)}:
+            element = document.named("actuator", name, "actuator")
+            if element.tag == "position":
+                _replace_drive(document, compiled, element)
     return document.text(), tuple(left_out)
 
 
@@ -97,8 +102,7 @@ def _set(document: Document, compiled: Any, unknown: Unknown, kind: str, name: s
     (array, first, factor), size = FIELDS[kind][field].arrays[0], FIELDS[kind][field].size
     index = getattr(compiled, kind)(name).id
     if kind == "actuator" and not _takes(document, element, field):
-        document.changes.pop((element.begin, element.inside), None)
-        document.changes[element.begin, element.end] = _general(compiled.actuator(name), element)
+        _replace_drive(document, compiled, element)
         return
     own = next(x for x in unknown.places if x.array == array and _belongs(compiled, kind, x.array, x.index[0], index))
     row = np.atleast_1d(getattr(compiled, array)[own.index[0]])[first : first + size] / factor
@@ -110,15 +114,25 @@ def _takes(document: Document, element: Element, field: str) -> bool:
     if document.changes.get((element.begin, element.end), element.tag).startswith("<general"):
         return False
     if field in ("kp", "kv"):
-        return element.tag == "position" and b"dampratio" not in document.source
-    return field == "gear" or element.tag == "general"
+        return element.tag == "position"
+    return (field == "gear" and element.tag != "muscle") or element.tag == "general"
 
 
-def _general(actuator: Any, element: Element) -> str:
+def _replace_drive(document: Document, compiled: Any, element: Element) -> None:
+    """Write an actuator as a general one."""
+    document.changes.pop((element.begin, element.inside), None)
+    document.changes[element.begin, element.end] = _general(compiled, element)
+
+
+def _general(compiled: Any, element: Element) -> str:
     """Element of an actuator of any kind with all that MuJoCo has made of it."""
-    mujoco = mujoco_module()
+    mujoco, actuator = mujoco_module(), compiled.actuator(element.attributes["name"])
     texts = {key: text for key, text in element.attributes.items() if key in _COMMON}
     texts["gear"] = numbers(actuator.gear)
+    if actuator.lengthrange.any():
+        texts["lengthrange"] = numbers(actuator.lengthrange)
+    if compiled.actuator_actearly[actuator.id]:
+        texts["actearly"] = "true"
     for key, enum in (("dyn", mujoco.mjtDyn), ("gain", mujoco.mjtGain), ("bias", mujoco.mjtBias)):
         kind = enum(int(np.ravel(getattr(actuator, f"{key}type"))[0])).name
         texts |= {f"{key}type": kind.rpartition("_")[2].lower(), f"{key}prm": numbers(getattr(actuator, f"{key}prm"))}

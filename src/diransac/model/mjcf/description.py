@@ -108,8 +108,10 @@ def compiled_of(label: str, source: Any) -> Any:
 
 def _forget_inertias(spec: Any) -> None:
     """Have MuJoCo infer the inertia of each body from its shapes before it discards those that are only looked at."""
+    low, high = spec.compiler.inertiagrouprange
     for body in spec.bodies:
-        body.ipos, body.explicitinertial = [np.nan] * 3, False
+        if any(low <= shape.group <= high for shape in body.geoms):
+            body.ipos, body.explicitinertial = [np.nan] * 3, False
     spec.compiler.inertiafromgeom = mujoco_module().mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
 

@@ -130,7 +130,7 @@ class MujocoModel(Model):
         parameters = {x.name: x.parameter for x in self.unknowns}
         taken = {n: unit for n, unit in readings.items() if n not in inputs}
         self.kinematics = None if derived else self._rates_of_coordinates  # type: ignore[assignment]
-        first_order = activations(compiled, (*coordinates, *velocities, *inputs))
+        first_order = activations(compiled, (*coordinates, *velocities, *inputs, *readings))
         groups = (coordinates, inputs, parameters, None if derived else velocities, first_order)
         self._name_signals(name, *groups, "", taken)
         names = [*(n for x in joints for n in x.accelerations), *(f"{n}_dot" for n in first_order)]

@@ -72,7 +72,7 @@ class Pass:
         diverge, 0 of others.
     scores : (W, n) array
         Contribution of each interval to minus the gradient of the loss with respect to the parameters, the delay of
-        the inputs last if it is estimated; less where an interval's samples show more noise than others.
+        the inputs last if it is estimated; less where an interval's samples show more noise.
     information : (n, n) array
     states : (W, n_x) array
         At the intervals' starts, after their samples.
@@ -232,6 +232,8 @@ class Predictor:
         unsure = np.array([_UNSURE.get(x, 0.3) for x in units])
         unsure[model.n_q :] *= 10.0
         seen: BoolArray = np.asarray(self.intervals.known.any(axis=0))
+        driven = np.isin(model.state, list(model.first_order))
+        unsure[driven] = np.maximum(unsure[driven], np.ptp(self.intervals.recorded, axis=0).max(initial=0.0))
         return np.where(seen[:n_x], np.minimum(self.noise.sigma[:n_x] + 0.03 * unsure, unsure), unsure)
 
     def first_state(self, w: int, rest: FloatArray) -> FloatArray:

@@ -19,6 +19,8 @@ from diransac.arrays import FloatArray
 
 TINY = 1e-12
 _ROUNDING = 1e-12
+_FREEDOM = 10.0
+"""Degrees of freedom of the noise of an interval: samples that would show as much by chance."""
 RADIUS = 3.0**0.5
 """Distance of the points from the mean, standard deviations, by a Gaussian's kurtosis."""
 
@@ -224,6 +226,6 @@ class Update:
 
         References
         ----------
-        Lange, Little, Taylor 1989 (a scale for each group of samples).
+        Lange, Little, Taylor 1989 (Student's t of groups of samples).
         """
-        return self.misfit / max(n_samples, TINY)
+        return (self.misfit + _FREEDOM) / (n_samples + _FREEDOM)
