@@ -328,6 +328,12 @@ def test_slopes_over_the_spread_are_local_ones_of_a_linear_machine(
     np.testing.assert_allclose(over.information[:2, :2], local.information[:2, :2], rtol=0.02)
     assert over.losses.sum() == pytest.approx(local.losses.sum(), abs=1.0)
     assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
+    noise = replace(ends[0].predictor.noise, pi=np.zeros_like(ends[0].predictor.noise.pi))
+    told = [
+        replace(ends[0].predictor, noise=replace(noise, sigma=noise.sigma / k)).over_logs(at).information[0, 0]
+        for k in (1.0, 3.0)
+    ]
+    assert 0.2 * told[0] < told[1] < 2.0 * told[0]  # not nine times as much: intervals show their noise
 
 
 @pytest.mark.parametrize("column", ["x0", "x0_dot"])

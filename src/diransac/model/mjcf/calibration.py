@@ -79,11 +79,7 @@ def calibrated_text(
             continue
         for kind, name in unknown.elements:
             _set(document, compiled, unknown, kind, name)
-    if b"dampratio" in document.source:  # another mass, too, would change what MuJoCo makes of it
-        for name in {compiled.actuator(k).name for k in range(compiled.nu)}:
-            element = document.named("actuator", name, "actuator")
-            if element.tag == "position":
-                _replace_drive(document, compiled, element)
+    _settle_dampings(document, compiled)
     return document.text(), tuple(left_out)
 
 
@@ -116,6 +112,14 @@ def _takes(document: Document, element: Element, field: str) -> bool:
     if field in ("kp", "kv"):
         return element.tag == "position"
     return (field == "gear" and element.tag != "muscle") or element.tag == "general"
+
+
+def _settle_dampings(document: Document, compiled: Any) -> None:
+    """Write servos as general actuators if any has a damping ratio, of which MuJoCo makes less with another mass."""
+    for name in {compiled.actuator(k).name for k in range(compiled.nu)} if b"dampratio" in document.source else ():
+        element = document.named("actuator", name, "actuator")
+        if element.tag == "position":
+            _replace_drive(document, compiled, element)
 
 
 def _replace_drive(document: Document, compiled: Any, element: Element) -> None:

@@ -306,16 +306,20 @@ class LocalSearch:
         if free_hold and _CONTINUOUS[0] < late < _CONTINUOUS[1]:
             others += [replace(punctual, hold=hold) for hold in ("linear", "smooth")]
         found = [intervals.with_input_error(error.kind, error.size)] if error else []
-        return found + [x for x in others if not {delay, lag} & sizes.keys() or self._promises(best, x)]
+        return found + (self._promising(best, others) if others and {delay, lag} & sizes.keys() else others)
 
-    def _promises(self, now: Explanation, other: ShootingIntervals) -> bool:
-        """True unless a fit is less likely with another timing than with its own, at the optimum of which it is.
+    def _promising(self, now: Explanation, others: Sequence[ShootingIntervals]) -> list[ShootingIntervals]:
+        """Other timings but those with which a fit is less likely than with its own, at the optimum of which it is.
 
         To first order, after the step that answers the change of the simulations.
         """
         own, fit, at = now.intervals, now.refinement.fit, linearized(now.intervals, now.refinement.fit).of_fit
-        step, change = answer(own, at, fit, other)
-        return not change - (at.right_z * step.step_z).sum() - at.right_s @ step.step_p > AS_LIKELY
+
+        def change(other: ShootingIntervals) -> float:
+            step, cost = answer(own, at, fit, other)
+            return float(cost - (at.right_z * step.step_z).sum() - at.right_s @ step.step_p)
+
+        return [x for x in others if not change(x) > AS_LIKELY]
 
     def _moved(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
         """The explanation with other inputs, and the same freedom."""
