@@ -95,16 +95,16 @@ def test_an_update_is_that_of_bayes_with_what_slopes_leave_as_noise():
     np.testing.assert_allclose(update.belief_of_end.covariance, covariance, atol=1e-9)
 
 
-def test_samples_that_are_wrong_together_show_more_noise():
+def test_samples_that_are_wrong_together_count_less():
     belief, rng = belief_of(4)[0], np.random.default_rng(5)
     J, F = rng.normal(size=(400, 1, N_X + N_P)), rng.normal(size=(N_X, N_X + N_P))
     noise, weights = rng.standard_normal((400, 1)), np.full((400, 1), 100.0)
     noise *= 0.1 / np.sqrt(np.mean(np.square(noise)))
-    shown = []
+    shares = []
     for error in (0.5 * noise, noise, 10.0 * noise, noise + 1.0):
         linear = LinearInterval.local(belief, N_Q, (error, J), (np.zeros(N_X), F))
-        shown.append(Update.of(belief, linear, weights).noise_over(400.0))
-    assert shown == pytest.approx([0.25, 1.0, 100.0, 101.0], rel=0.1)
+        shares.append(Update.of(belief, linear, weights).share(400.0))
+    assert shares == pytest.approx([1.0, 1.0, 0.1, 0.1], rel=0.1)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 1.0])

