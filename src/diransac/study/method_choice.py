@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.identification.method import Method
 from diransac.identification.methods import (
     ESTIMATORS,
@@ -61,9 +61,7 @@ class MethodChoice:
             The method has no such setting, or a value has no meaning.
         """
         own = default_options(self.method)
-        unknown = [name for name in self.options if name not in own]
-        if unknown:
-            raise SettingsError(f'there is no option "{unknown[0]}"; there are {", ".join(own) or "none"}')
+        check_known(self.options, own, "there is no option", "there are")
         inside = {}
         if self.estimator != _OWN_ESTIMATOR:
             if self.method not in WITH_ESTIMATOR:

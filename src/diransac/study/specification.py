@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from diransac.errors import DiransacError, SettingsError
+from diransac.errors import DiransacError, SettingsError, check_known
 from diransac.flight.noise import Noise
 from diransac.flight.planning import multisine, random_waypoints, sine, square, star
 from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
@@ -442,6 +442,4 @@ class Study(Table):
 def _check_flown(trajectory: str, model: Model, arguments: Mapping[str, Any]) -> None:
     """Raises SettingsError: no model of this structure can fly the trajectory, or it has no such input."""
     (check_fully_actuated if trajectory == "multisine" else check_plane)(model)
-    for name in arguments.get("input_weights", {}):
-        if name not in model.inputs:
-            raise SettingsError(f'input_weights names "{name}"; inputs are {", ".join(model.inputs)}')
+    check_known(arguments.get("input_weights", {}), model.inputs, "input_weights names", "inputs are")
