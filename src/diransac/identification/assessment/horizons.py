@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, runs
+from diransac.arrays import BoolArray, FloatArray, IntArray, runs, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
 from diransac.errors import LogError
@@ -432,7 +432,7 @@ def _unmeasured(
     compared = np.column_stack([states[:, observed], *sensors])
     seen = np.isfinite(compared)
     spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
-    weights = np.where(seen, 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    weights = np.where(seen, 1.0 / np.square(size_or_one(spread)), 0.0)
     readings = np.nan_to_num(compared[:, len(observed) :])
     # The observers forget within a twentieth of the log.
     bandwidth = 1.0 / (0.05 * len(segment) * segment.log.dt)

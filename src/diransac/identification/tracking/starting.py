@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diransac.arrays import FloatArray, long_runs
+from diransac.arrays import FloatArray, long_runs, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
@@ -261,8 +261,8 @@ def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, moti
     """Fit of the first n intervals of a stream from the parameters of a start."""
     intervals, p = setup.intervals(stream, first, n), given.parameters
     if given.covariance is None:
-        unit = parameter_units(intervals, motion, p)
-        covariance = np.diag(np.square(np.maximum(np.abs(p), np.where(unit > 0.0, unit, 1.0))))
+        units = size_or_one(parameter_units(intervals, motion, p))
+        covariance = np.diag(np.square(np.maximum(np.abs(p), units)))
     else:
         covariance = given.covariance
     std = np.sqrt(np.diag(covariance))
