@@ -30,6 +30,16 @@ def size_or_one(sizes: FloatArray) -> FloatArray:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
+def interpolated(columns: FloatArray) -> FloatArray:
+    """Columns ``(N, n)`` with missing samples interpolated, and held at both ends; 0 without any sample."""
+    filled, rows = columns.copy(), np.arange(len(columns))
+    for column in filled.T:
+        known = np.isfinite(column)
+        if not known.all():
+            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
+    return filled
+
+
 def runs(mask: BoolArray) -> list[slice]:
     """Runs of the elements of a mask ``(N,)`` that are True.
 

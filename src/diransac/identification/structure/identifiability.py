@@ -97,6 +97,11 @@ class Ambiguity:
 # ---------------------------------------------------------------------- ambiguities of the equations
 
 
+def equations_in_words(found: Sequence[Ambiguity]) -> str:
+    """A sentence on each ambiguity of the equations."""
+    return "; ".join(x.sentence(x.of_equations()) for x in found)
+
+
 def joined(found: Sequence[Ambiguity]) -> tuple[Ambiguity, ...]:
     """Ambiguities, with all parameters that are in no combination as one."""
     alone = tuple(name for x in found if not x.n_determined for name in x.names)

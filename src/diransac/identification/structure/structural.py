@@ -24,6 +24,7 @@ from diransac.identification.structure.identifiability import (
     ambiguity_of,
     collinear,
     components,
+    equations_in_words,
     in_words,
     joined,
     of_logs,
@@ -135,7 +136,7 @@ def check_structure(
     """
     found = structural(model, measured, ranges)
     if sum(len(x.names) for x in found) > allow:
-        raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
+        raise IdentificationError(f"{source}: {equations_in_words(found)}")
 
 
 def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> FloatArray:
