@@ -378,7 +378,7 @@ def observers(
 @lru_cache(maxsize=64)
 def _free_of_turns(model: Model) -> frozenset[str]:
     """Coordinates in rad that may gain a whole turn with no effect on the equations, tried at random points."""
-    symbols = [ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup")]
+    symbols = [ca.SX.sym(n, size) for n, size in model.argument_sizes.items()]
     parts = [model.residual(*symbols)]
     if model.kinematics is not None:
         parts.append(model.kinematics(*symbols[:2]))

@@ -360,7 +360,7 @@ def residual_slopes(model: Model) -> ca.Function:
     ----------
     model : Model
     """
-    symbols = [ca.SX.sym(name, model.residual.size1_in(i)) for i, name in enumerate("qvaup")]
+    symbols = [ca.SX.sym(n, size) for n, size in model.argument_sizes.items()]
     outputs = model.residual(*symbols)
     if model.measurement is not None:
         outputs = ca.vertcat(outputs, model.measurement(*symbols))
