@@ -1,4 +1,4 @@
-"""The array types of every signature, whose shapes are in the docstrings; robust scale of arrays, and runs in masks."""
+"""The array types of every signature, whose shapes are in the docstrings; robust scales, sizes, and runs in masks."""
 
 from collections.abc import Iterator
 
@@ -23,6 +23,21 @@ def row_blocks(n_rows: int, at_a_time: int = _ROWS_AT_A_TIME) -> Iterator[slice]
 def robust_std(deviations: FloatArray, axis: int | None = None) -> FloatArray:
     """Standard deviation of normal deviations from zero, by the median of their sizes: up to half may be outliers."""
     return np.asarray(MAD_TO_STD * np.median(np.abs(deviations), axis=axis))
+
+
+def size_or_one(sizes: FloatArray) -> FloatArray:
+    """Sizes by which arrays are divided: 1 in place of those that are not positive."""
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def interpolated(columns: FloatArray) -> FloatArray:
+    """Columns ``(N, n)`` with missing samples interpolated, and held at both ends; 0 without any sample."""
+    filled, rows = columns.copy(), np.arange(len(columns))
+    for column in filled.T:
+        known = np.isfinite(column)
+        if not known.all():
+            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
+    return filled
 
 
 def runs(mask: BoolArray) -> list[slice]:

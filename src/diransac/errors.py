@@ -15,6 +15,8 @@
 Messages state the problem, the value found, and the remedy.
 """
 
+from collections.abc import Iterable
+
 
 class DiransacError(Exception):
     """Base class of the exceptions of diransac."""
@@ -50,3 +52,13 @@ class StudyError(DiransacError):
 
 class TimeLimitError(DiransacError):
     """A time limit was reached before an answer was found."""
+
+
+def check_known(
+    names: Iterable[str], known: Iterable[str], said: str, there: str, error: type[DiransacError] = SettingsError
+) -> None:
+    """Raise an error of a class, such as ``said "name"; there a, b, c``, where a name is none of those known."""
+    there_are = list(known)
+    for name in names:
+        if name not in there_are:
+            raise error(f'{said} "{name}"; {there} {", ".join(there_are) or "none"}')

@@ -15,6 +15,20 @@ from functools import lru_cache
 from threadpoolctl import ThreadpoolController
 
 
+def end_with_parent() -> None:
+    """End this process once its parent has ended, also where that was killed."""
+    from multiprocessing import parent_process
+
+    parent = parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 class _Setting:
     """Context in which a setting of the process holds; the last context to end undoes it, whichever began.
 

@@ -181,7 +181,6 @@ class Search:
     input_hold: Annotated[
         str | None,
         typer.Option(
-            "--input-hold",
             callback=_known("hold", HOLDS),
             metavar="|".join(HOLDS),
             help="Inputs between samples: held, or interpolated linearly or smoothly.",
@@ -246,38 +245,29 @@ class Preparation:
     """Options of the preparation of a log, applied in this order."""
 
     episodes: Annotated[
-        str | None,
-        _option("--episodes", metavar="N,START:END,...", help="Of a LeRobot dataset: 0:10 are the first ten."),
+        str | None, _option(metavar="N,START:END,...", help="Of a LeRobot dataset: 0:10 are the first ten.")
     ] = None
     mapping: Annotated[
-        str | None,
-        _option("--mapping", metavar="NAME|FILE.toml", help="Topics to signals: a file, or px4-multirotor, ..."),
+        str | None, _option(metavar="NAME|FILE.toml", help="Topics to signals: a file, or px4-multirotor, ...")
     ] = None
     columns: Annotated[
-        str | None, _option("--columns", metavar="NAME,...", help="Names of the columns of a CSV file without header.")
+        str | None, _option(metavar="NAME,...", help="Names of the columns of a CSV file without header.")
     ] = None
-    rate: Annotated[float | None, _option("--rate", metavar="HZ", help="Rate of a file without time.")] = None
+    rate: Annotated[float | None, _option(metavar="HZ", help="Rate of a file without time.")] = None
     repair: Annotated[
-        str | None,
-        _option("--repair", metavar="safe|NAME,...", help=f"Repair instead of refusing: {', '.join(REPAIRS)}."),
+        str | None, _option(metavar="safe|NAME,...", help=f"Repair instead of refusing: {', '.join(REPAIRS)}.")
     ] = None
     rename: Annotated[
-        list[str] | None,
-        _option("--map", metavar="NEW=OLD,...", help="Columns to rename: position=q_m,t=t_s."),
+        list[str] | None, _option("--map", metavar="NEW=OLD,...", help="Columns to rename: position=q_m,t=t_s.")
     ] = None
     scale: Annotated[
-        list[str] | None,
-        _option("--scale", metavar="NAME=FACTOR,...", help="Signals to multiply, by their new names."),
+        list[str] | None, _option(metavar="NAME=FACTOR,...", help="Signals to multiply, by their new names.")
     ] = None
     resample: Annotated[
-        str | None,
-        _option("--resample", metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one."),
+        str | None, _option(metavar="HZ|median", help="Resample at a uniform rate; median: the clock's usual one.")
     ] = None
     unmeasured: Annotated[
-        str | None,
-        _option(
-            "--unmeasured", metavar="NAME,...", help="Coordinates that the log lacks although a column is named alike."
-        ),
+        str | None, _option(metavar="NAME,...", help="Coordinates that the log lacks although a column is named alike.")
     ] = None
     start: Annotated[
         float | None, _option("--from", callback=_moment, metavar="S", help="Leave out what comes before.")
@@ -293,11 +283,9 @@ class Preparation:
         str | None,
         _option("--leave-out", metavar="S:S,...", help="Leave out stretches of time, from start to end: 4.8:5.9."),
     ] = None
-    despike: Annotated[
-        str | None, _option("--despike", metavar="all|NAME,...", help="Signals to take spikes out of.")
-    ] = None
+    despike: Annotated[str | None, _option(metavar="all|NAME,...", help="Signals to take spikes out of.")] = None
     shift: Annotated[
-        list[str] | None, _option("--shift", metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
+        list[str] | None, _option(metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
     ] = None
 
     def grow(self, file: Path, like: Sequence[Mapping[str, Any]] = ()) -> Growing:

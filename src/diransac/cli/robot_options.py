@@ -55,34 +55,26 @@ class RobotOptions:
     """Options of `diransac.models.robot`."""
 
     unknown: Annotated[
-        str | None,
-        _option("--unknown", metavar="NAME,...", help="Unknown parameters of joints: armature,damping,friction, ..."),
+        str | None, _option(metavar="NAME,...", help="Unknown parameters of joints: armature,damping,friction, ...")
     ] = None
     control: Annotated[
-        str | None,
-        _option("--control", metavar="kp=20,kd=1.5,...", help="Position control; target=des_{} names columns."),
+        str | None, _option(metavar="kp=20,kd=1.5,...", help="Position control; target=des_{} names columns.")
     ] = None
     motor: Annotated[
-        str | None,
-        _option("--motor", metavar="constant=0.1,gear=9,...", help="Motors with measured currents, current=i_{}."),
+        str | None, _option(metavar="constant=0.1,gear=9,...", help="Motors with measured currents, current=i_{}.")
     ] = None
     bodies: Annotated[
-        str | None, _option("--bodies", metavar="all|NAME,...", help="Bodies with unknown inertial parameters.")
+        str | None,
+        _option(metavar="all|NAME,...", help="Bodies with unknown inertial parameters."),
     ] = None
     joints: Annotated[
-        str | None,
-        _option("--joints", metavar="NAME,...|{}_joint", help="Joints, as column=joint if names differ; or a pattern."),
+        str | None, _option(metavar="NAME,...|{}_joint", help="Joints, as column=joint if names differ; or a pattern.")
     ] = None
     base: Annotated[
-        str | None, _option("--base", metavar="held|measured", help="A floating base: held, or with a measured motion.")
+        str | None, _option(metavar="held|measured", help="A floating base: held, or with a measured motion.")
     ] = None
     simulator: Annotated[
-        str | None,
-        _option(
-            "--simulator",
-            metavar="mujoco",
-            help="Contacts, loops, tendons; --unknown KIND/NAME.FIELD,...",
-        ),
+        str | None, _option(metavar="mujoco", help="Contacts, loops, tendons; --unknown KIND/NAME.FIELD,...")
     ] = None
 
     def load(self, model: str) -> Model:

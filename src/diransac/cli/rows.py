@@ -126,11 +126,10 @@ class FleetOptions:
 
     each: Annotated[bool, _option("--each", help="Identify from each log by itself, into a store.")] = False
     store: Annotated[
-        Path | None, _option("--store", metavar="FILE.db", help="Rows, one per log; those it has are not run again.")
+        Path | None, _option(metavar="FILE.db", help="Rows, one per log; those it has are not run again.")
     ] = None
     vehicle: Annotated[
-        str | None,
-        _option("--vehicle", metavar="REGEX", help="Vehicle in a log's name: '(?P<vehicle>[^/]+)/(?P<time>.*)'."),
+        str | None, _option(metavar="REGEX", help="Vehicle in a log's name: '(?P<vehicle>[^/]+)/(?P<time>.*)'.")
     ] = None
     jobs: Jobs = None
     cluster: Cluster = None

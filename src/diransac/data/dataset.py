@@ -13,7 +13,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.log import Log
 from diransac.data.segment import Segment, bind_log, bulk_range
-from diransac.errors import LogError, SettingsError
+from diransac.errors import LogError, SettingsError, check_known
 from diransac.model.parameter import parameter_of
 
 if TYPE_CHECKING:
@@ -413,9 +413,7 @@ class Dataset:
             The model, or a log, has no signal of that name.
         """
         for name, value in values.items():
-            if name not in self.model.signals:
-                known = ", ".join(self.model.signals)
-                raise SettingsError(f'model "{self.model.name}" has no signal "{name}"; it has {known}')
+            check_known([name], self.model.signals, f'model "{self.model.name}" has no signal', "it has")
             if value > 0.0 and name not in self.common_signals:
                 lacking = next(one.log.source for one in self.segments if name not in one.present)
                 raise SettingsError(f'{lacking}: a setting names "{name}", which the log lacks; leave it out')

@@ -41,16 +41,6 @@ class Condition:
         return " and ".join([*limits, *([f"below {self.below:g}"] if self.below < math.inf else [])])
 
 
-def _between_ned_and_enu(v: Sequence[FloatArray]) -> list[FloatArray]:
-    x, y, z = v
-    return [y, x, -z]
-
-
-def _between_frd_and_flu(v: Sequence[FloatArray]) -> list[FloatArray]:
-    x, y, z = v
-    return [x, -y, -z]
-
-
 def _other_attitude(q: Sequence[FloatArray]) -> list[FloatArray]:
     """Attitude ``r o q o s`` of a body with axes FLU in ENU, from that of FRD in NED, or the reverse.
 
@@ -62,8 +52,8 @@ def _other_attitude(q: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 AXES = {
-    **dict.fromkeys(("ned-to-enu", "enu-to-ned"), _between_ned_and_enu),
-    **dict.fromkeys(("frd-to-flu", "flu-to-frd"), _between_frd_and_flu),
+    **dict.fromkeys(("ned-to-enu", "enu-to-ned"), lambda v: [v[1], v[0], -v[2]]),
+    **dict.fromkeys(("frd-to-flu", "flu-to-frd"), lambda v: [v[0], -v[1], -v[2]]),
 }
 """Changes of frame of a vector."""
 ATTITUDES = dict.fromkeys(("ned-frd-to-enu-flu", "enu-flu-to-ned-frd"), _other_attitude)

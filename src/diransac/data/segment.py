@@ -14,7 +14,7 @@ from diransac.data import preprocessing
 from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.log import Log
 from diransac.data.preprocessing.continuity import interpolated
-from diransac.errors import LogError, SettingsError
+from diransac.errors import LogError, check_known
 
 if TYPE_CHECKING:
     from diransac.model import Model
@@ -133,9 +133,7 @@ class Segment:
             The rule names an unknown state.
         """
         given = rule if isinstance(rule, Mapping) else {}
-        unknown = [n for n in given if n not in self.model.state]
-        if unknown:
-            raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(self.model.state)}')
+        check_known(given, self.model.state, "initial_state names", "the state is")
         matter = self.model.states_behind(self.present)
         start = np.zeros(len(self.model.state))
         start[[four[0] for four in self.model.quaternions]] = 1.0

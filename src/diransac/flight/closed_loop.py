@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.log import Log
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.model.plant import ModelWithParameters, Plant, as_plant
 from diransac.simulation import LinearFeedback, RolloutBatch, Simulator, default_threads, rollouts
 
@@ -186,9 +186,7 @@ def tracking_error(trajectory: Trajectory, log: Log) -> dict[str, float]:
 def _start(plant: Plant, trajectory: Trajectory, changes: Mapping[str, float]) -> FloatArray:
     """Initial state (n_x,): the trajectory's, with changes by name."""
     names = plant.model.state
-    unknown = [name for name in changes if name not in names]
-    if unknown:
-        raise SettingsError(f'initial_state names "{unknown[0]}"; states are {", ".join(names)}')
+    check_known(changes, names, "initial_state names", "states are")
     if trajectory.states.shape[1] != len(names):
         raise SettingsError(
             f"the trajectory has {trajectory.states.shape[1]} states; the plant has {len(names)}: {', '.join(names)}"

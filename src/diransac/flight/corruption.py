@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray
 from diransac.data.log import Log
 from diransac.data.preprocessing import shift
-from diransac.errors import LogError, SettingsError
+from diransac.errors import LogError, SettingsError, check_known
 from diransac.flight.noise import Draws, Noise, gaussian_errors, leverage_rows, quantised, with_faults
 
 
@@ -184,9 +184,8 @@ def _check_arguments(log: object, noise: object, seed: object, signals: Sequence
         if name == "t":
             raise SettingsError('signals names "t", the time, which cannot be corrupted')
         log[name]
-    unknown = [] if isinstance(noise.quantisation, float) else [n for n in noise.quantisation if n not in names]
-    if unknown:
-        raise SettingsError(f'quantisation names "{unknown[0]}"; the corrupted signals are {", ".join(names)}')
+    if not isinstance(noise.quantisation, float):
+        check_known(noise.quantisation, names, "quantisation names", "the corrupted signals are")
     return names
 
 

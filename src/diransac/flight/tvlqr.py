@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing import continuous_quaternions
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.flight.riccati import Problem, gains_of
 from diransac.flight.trajectory import InputLimits, Trajectory, half_ranges, is_even
 from diransac.model import Model
@@ -288,9 +288,7 @@ def _limits_of(model: Model, trajectory: Trajectory, limits: InputLimits | None)
     Raises SettingsError: an unknown name, or limits that are not a pair in increasing order.
     """
     limits = trajectory.input_limits if limits is None else limits
-    unknown = [name for name in limits if name not in model.inputs]
-    if unknown:
-        raise SettingsError(f'limits name "{unknown[0]}"; inputs are {", ".join(model.inputs)}')
+    check_known(limits, model.inputs, "limits name", "inputs are")
     pairs = [limits.get(name, (-np.inf, np.inf)) for name in model.inputs]
     if not all(np.shape(pair) == (2,) and pair[0] <= pair[1] for pair in pairs):
         raise SettingsError(f"limits are {dict(limits)}, but each must be (lowest, highest)")
@@ -328,9 +326,7 @@ def _matrix(name: str, weights: Weights, names: Sequence[str]) -> FloatArray:
     Raises SettingsError: an unknown name, another shape, not finite, not symmetric, or not positive semidefinite.
     """
     if isinstance(weights, Mapping):
-        unknown = [key for key in weights if key not in names]
-        if unknown:
-            raise SettingsError(f'{name} weighs "{unknown[0]}"; there are {", ".join(names)}')
+        check_known(weights, names, f"{name} weighs", "there are")
         weights = [weights.get(key, 0.0) for key in names]
     try:
         array, n = np.array(weights, np.float64), len(names)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,10 @@ class Resolution:
         """Interpolation of the inputs, in words; empty where they are held."""
         how = {"linear": "linearly", "smooth": "smoothly"}.get(self.hold)
         return f"inputs interpolated {how}" if how else ""
+
+
+_BY_WINDOW = ("unmodelled_accelerations", "unmodelled_forces", "suggested_terms", "smoothed_states")
+"""Series of a diagnosis with a value for each window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +114,7 @@ class Diagnosis:
 
     def __post_init__(self) -> None:
         series = [self.window_log, self.unmodelled_time, self.smoothed_time]
-        for name in (
-            "noise_std",
-            "outlier_fraction",
-            "outliers",
-            "unmodelled_accelerations",
-            "unmodelled_forces",
-            "suggested_terms",
-            "smoothed_states",
-        ):
+        for name in ("noise_std", "outlier_fraction", "outliers", *_BY_WINDOW):
             values = dict(getattr(self, name))
             series += [x for x in values.values() if isinstance(x, np.ndarray)]
             object.__setattr__(self, name, MappingProxyType(values))
@@ -126,8 +123,8 @@ class Diagnosis:
 
     def check_windows(self) -> None:
         """Raise ValueError: the figures of windows are not as many as these, or squares of them overflow."""
-        named = (self.unmodelled_accelerations, self.unmodelled_forces, self.suggested_terms, self.smoothed_states)
-        figures = (self.unmodelled_time, self.smoothed_time, *(x for values in named for x in values.values()))
+        named = (x for name in _BY_WINDOW for x in getattr(self, name).values())
+        figures = (self.unmodelled_time, self.smoothed_time, *named)
         if any(len(x) != len(self.window_log) for x in figures):
             raise ValueError(f"figures of other than {len(self.window_log)} windows")
         if not all((np.abs(x) < 1e150).all() for x in figures):
@@ -140,16 +137,14 @@ class Diagnosis:
     def of_log(self, log: int, rows: slice) -> Diagnosis:
         """The diagnosis of one log alone, whose rows among those of all logs are given."""
         windows = self.windows_of(log)
+        series: Any = {name: {n: x[windows] for n, x in getattr(self, name).items()} for name in _BY_WINDOW}
         return replace(
             self,
             outliers={name: mask[rows] for name, mask in self.outliers.items()},
             window_log=np.zeros_like(windows),
             unmodelled_time=self.unmodelled_time[windows],
-            unmodelled_accelerations={n: x[windows] for n, x in self.unmodelled_accelerations.items()},
-            unmodelled_forces={n: x[windows] for n, x in self.unmodelled_forces.items()},
-            suggested_terms={n: x[windows] for n, x in self.suggested_terms.items()},
             smoothed_time=self.smoothed_time[windows],
-            smoothed_states={n: x[windows] for n, x in self.smoothed_states.items()},
+            **series,
         )
 
     def first_states(self, log: int) -> dict[str, float]:

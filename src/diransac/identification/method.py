@@ -14,6 +14,7 @@ from diransac.data.log import Log
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import motion_rows
 from diransac.identification.settings import Settings
+from diransac.identification.structure.identifiability import equations_in_words
 from diransac.identification.structure.refusal import cause_of_refusal
 from diransac.identification.structure.structural import structural
 from diransac.model import Model
@@ -133,7 +134,7 @@ def _cause_of_failure(dataset: Dataset) -> str:
     model = dataset.model
     found = structural(model, ranges=dataset.ranges) if model.has_equations else ()
     if found:
-        return "; ".join(x.sentence(x.of_equations()) for x in found)
+        return equations_in_words(found)
     needed = {*model.state, *model.accelerations}
     if not (model.has_equations and all(needed <= set(one.present) for one in dataset.segments)):
         return "the fit diverges; check the model's constants and units, bound the parameters, or try another method"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.estimate import Competition, Estimate, Evaluation, LogSummary
 from diransac.identification.evaluation.findings import findings_of
 from diransac.identification.finding import Finding, Verdict, verdict_of
-from diransac.identification.regression.uncertainty import student_quantile, students_draws
+from diransac.identification.regression.uncertainty import student_quantile, students_draws, two_sided
 from diransac.identification.result_text import html_of, text_of
 from diransac.identification.settings import Settings
 from diransac.identification.structure.lacking_terms import (
@@ -158,11 +158,8 @@ class Result:
         SettingsError
             The level is not between 0 and 1.
         """
-        if not 0.0 < level < 1.0:
-            raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
-        width = student_quantile(self.degrees_of_freedom, 0.5 + level / 2.0)
-        errors = self.standard_errors
-        return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
+        quantile = partial(student_quantile, self.degrees_of_freedom)
+        return two_sided(level, quantile, self.parameters, self.standard_errors)
 
     def structural_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Interval of each parameter, if the model may lack a term.

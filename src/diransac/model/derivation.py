@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, size_or_one
 from diransac.errors import DiransacError, ModelError
 from diransac.limits import MOST_NAMES, MOST_SOLVED, beyond
 from diransac.model import expressions
@@ -305,10 +305,9 @@ def mass_matrix_sign(label: str, probe: Probe, mass_matrix: ca.Function, acceler
     n = len(accelerations)
     M = stacked.reshape(n, _N_POINTS, n).transpose(1, 0, 2)
     M = M[np.isfinite(M).all(axis=(1, 2))]
-    rows = np.abs(M).max(axis=2, keepdims=True, initial=0.0)
-    scaled = M / np.where(rows > 0.0, rows, 1.0)
-    columns = np.abs(scaled).max(axis=1, keepdims=True, initial=0.0)
-    _, values, vectors = np.linalg.svd(scaled / np.where(columns > 0.0, columns, 1.0))
+    scaled = M / size_or_one(np.abs(M).max(axis=2, keepdims=True, initial=0.0))
+    columns = size_or_one(np.abs(scaled).max(axis=1, keepdims=True, initial=0.0))
+    _, values, vectors = np.linalg.svd(scaled / columns)
     if len(M) == 0 or (values[:, -1] <= 1e-10 * values[:, 0]).all():
         loose = np.abs(vectors[:, -1]).max(axis=0, initial=0.0) > 1e-6
         names = [x for x, l in zip(accelerations, loose, strict=True) if l] or list(accelerations)

@@ -361,8 +361,21 @@ class Model(Signals):
             own = ca.vertcat(*(values[n] if n in values else p[n] for n in self.parameters))
             return [*(ca.SX(ca.vertcat(*x)) for x in (q, v, a, u)), own]
 
-        def equations(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[Any]:
-            return [self.residual(*arguments(q, v, a, u, p))]
+        return self.with_equations(
+            self.name,
+            {n: x for n, x in self.parameters.items() if n not in values},
+            lambda *symbols: [self.residual(*arguments(*symbols))],
+            {n: x for n, x in self.sensors_of(arguments).items() if n in sensors},
+        )
+
+    def with_equations(
+        self,
+        name: str,
+        parameters: Mapping[str, Parameter],
+        equations: Callable[..., Sequence[Any]],
+        sensors: Mapping[str, Sensor],
+    ) -> Model:
+        """Another model of the same coordinates, velocities and inputs, with the same kinematics."""
 
         def kinematics(q: Symbols, v: Symbols) -> list[Any]:
             assert self.kinematics is not None
@@ -370,15 +383,15 @@ class Model(Signals):
 
         has_kinematics = self.kinematics is not None
         return Model(
-            self.name,
+            name,
             self.coordinates,
             self.inputs,
-            {n: x for n, x in self.parameters.items() if n not in values},
+            parameters,
             equations,
             velocities=self.velocities_of_motion if has_kinematics else None,
             kinematics=kinematics if has_kinematics else None,
             first_order=self.first_order,
-            sensors={n: x for n, x in self.sensors_of(arguments).items() if n in sensors},
+            sensors=sensors,
             description=self.description,
         )
 

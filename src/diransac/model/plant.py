@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from diransac.arrays import FloatArray
-from diransac.errors import ModelError, SettingsError
+from diransac.errors import ModelError, SettingsError, check_known
 from diransac.model import derivation, expressions
 from diransac.model.derivation import Symbols
 from diransac.model.model import Model
@@ -131,11 +131,7 @@ class Disturbance:
             raise ModelError(f"{self._label}: a name is used twice; found {', '.join(self._own)}; t is the time")
         if bool(self.states) != has_rates:
             raise ModelError(f"{self._label}: states need rates; give both or neither")
-        unknown = [name for name in self.start if name not in self.states]
-        if unknown:
-            raise ModelError(
-                f'{self._label}: start names "{unknown[0]}"; states are {", ".join(self.states) or "none"}'
-            )
+        check_known(self.start, self.states, f"{self._label}: start names", "states are", ModelError)
         numbers = {**self.constants, **self.start, "highest_frequency": self.highest_frequency}
         for name, value in numbers.items():
             is_range = name in self.start and isinstance(value, tuple)
@@ -159,9 +155,7 @@ class Disturbance:
 
         def ordered(*symbols: Symbols) -> list[Any]:
             returned = effect(*symbols)
-            unknown = [name for name in returned if name not in names]
-            if unknown:
-                raise ModelError(f'{self._label}: {what} name "{unknown[0]}"; there are {", ".join(names) or "none"}')
+            check_known(returned, names, f"{self._label}: {what} name", "there are", ModelError)
             return [returned.get(name, 0.0) for name in names]
 
         column = derivation.call_user(self._label, what, ordered, *arguments)

@@ -135,7 +135,8 @@ def _drawn(summary: Summary, title: str) -> Figure:
     height = _row_height(len(methods)) * len(rows)
     figure, header = headed_figure(list(looks.items()), title, above + height + below + LINE * len(caption) + 0.08)
     top = header + above
-    left = _names_width([row.name for row in rows], heading)
+    # The names of rows and their heading with margins, of 0.059 inches a letter.
+    left = 0.25 + 0.059 * max(len(line) for name in (*(row.name for row in rows), heading) for line in _lines(name))
     write_at(figure, left, header, "Error of the worst parameter, %", fontsize=9.5, color=INK)
     _name_rows(figure, (left, top), rows, len(methods), heading)
     _draw_rows(figure, (left, top, WIDTH - left - 0.12), rows, looks, scale)
@@ -283,12 +284,6 @@ def _shade(axes: Axes, rows: Sequence[MarkRow], scale: LogAxis) -> None:
     apart = [scale.none - 0.6 * _ROOM] * scale.endless + [scale.low - 0.4 * _ROOM] * (scale.low > LEAST)
     if apart:
         axes.vlines(apart, 0, len(rows), color=MUTED, linewidth=0.7, linestyle=":", zorder=1.0)
-
-
-def _names_width(names: Sequence[str], heading: str) -> float:
-    """Width of the names of rows and their heading with margins, inches."""
-    # Width of a letter of a row's name, inches; letters per line.
-    return 0.25 + 0.059 * max(len(line) for name in (*names, heading) for line in _lines(name))
 
 
 def _name_rows(

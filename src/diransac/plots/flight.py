@@ -103,7 +103,7 @@ def _legend_entries(flights: Sequence[FlightCurve]) -> list[LegendEntry]:
     if any(seen[name][0] <= limit <= seen[name][1] for name in inputs for limit in limits.get(name, ())):
         entries.append(("limits", _LIMIT_STYLE))
     marks: dict[str, Any] = {"color": MUTED, "linestyle": "none", "markersize": 6}
-    if any(_first_outside(f.log[name], seen[name]) is not None for f in flights for name in seen):
+    if any(((f.log[name] < low) | (f.log[name] > high)).any() for f in flights for name, (low, high) in seen.items()):
         entries.append(("leaves the panel", {"marker": "^", **marks}))
     if any(_last_finite(f.log[name]) is not None for f in flights for name in seen):
         entries.append(("last finite value", {"marker": "X", **marks}))
@@ -221,12 +221,6 @@ def _finite(values: Iterable[float]) -> FloatArray:
 
 
 # Ends of curves ----------------------------------------------------------------------------------------------------
-def _first_outside(values: FloatArray, visible: Range) -> int | None:
-    """First row outside of the range, or None."""
-    outside = np.flatnonzero((values < visible[0]) | (values > visible[1]))
-    return int(outside[0]) if len(outside) else None
-
-
 def _last_finite(values: FloatArray) -> int | None:
     """Last finite row, if rows follow; otherwise None."""
     finite = np.flatnonzero(np.isfinite(values))

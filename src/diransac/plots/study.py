@@ -271,6 +271,8 @@ def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArr
     share : (n_levels, n_methods)   fraction of the trials; NaN without trials
     names : height of the names of levels, inches
     """
+    from matplotlib.colors import LinearSegmentedColormap
+
     failing, looks = _failing(share), method_looks(summary.methods)
     if not failing:
         write_at(figure, 0.1, top + 0.05, "No trial failed.", color=INK)
@@ -279,8 +281,9 @@ def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArr
     axes = axes_at(figure, 1.75, top + 0.21 + names, 7.08, _CELL * len(failing))
     shown = np.nan_to_num(share[:, failing].T)
     edges = [np.arange(n + 1) - 0.5 for n in shown.T.shape]
-    axes.pcolormesh(*edges, np.where(shown > 0.0, 0.12 + 0.6 * shown, 0.0), cmap=_failure_colours(), vmin=0.0, vmax=1.0,
-                    edgecolors=PAPER, linewidth=1.4)  # fmt: skip
+    colours = LinearSegmentedColormap.from_list("failures", [SOFT, "#b42318"])  # of an empty cell, and of failures
+    darkness = np.where(shown > 0.0, 0.12 + 0.6 * shown, 0.0)
+    axes.pcolormesh(*edges, darkness, cmap=colours, vmin=0.0, vmax=1.0, edgecolors=PAPER, linewidth=1.4)
     axes.grid(visible=False)
     axes.invert_yaxis()
     axes.tick_params(labeltop=True, labelbottom=False)
@@ -299,10 +302,3 @@ def _draw_failures(figure: Figure, top: float, summary: Summary, share: FloatArr
 def _failing(share: FloatArray) -> list[int]:
     """Indices of the methods with failures."""
     return [int(k) for k in np.flatnonzero((np.nan_to_num(share) > 0.0).any(axis=0))]
-
-
-def _failure_colours() -> Any:
-    """Colours from that of an empty cell to that of failures, as in the report."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("failures", [SOFT, "#b42318"])

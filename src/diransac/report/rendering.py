@@ -10,8 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from diransac.atomic import write_text
-from diransac.errors import ResultError
+from diransac.identification import result_files
 from diransac.text_table import number, percent, plural
 
 if TYPE_CHECKING:
@@ -80,10 +79,7 @@ def write_page(path: str | Path, template: str, *, style: str = "", script: str 
     """
     rules, code = _asset("page.css") + (_asset(style) if style else ""), _asset(script) if script else ""
     text = environment().get_template(template).render(style=rules, script=code, policy=_policy(code), **content)
-    try:
-        write_text(path, f"{encodable(text)}\n")
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror}") from error
+    result_files.write(path, f"{encodable(text)}\n")
 
 
 def encodable(text: str) -> str:

@@ -148,7 +148,7 @@ def _write(rerun: Any, entry: Entry, file: Path) -> None:
             layout.TimeSeriesView(origin=rerun.new_entity_path([*above, _text(group)]), name=_text(group))
             for group in dict.fromkeys(one.path[0] for one in series)
         ]
-        if _can_replay(run):
+        if isinstance(run.result.model, MujocoModel) and run.view.diagnosis is not None:
             _send_replay(rerun, recording, above, run)
             views.insert(0, layout.Spatial3DView(origin=rerun.new_entity_path([*above, "replay"]), name="replay"))
         tabs.append(layout.Grid(*views, name=_text(run.log_name)))
@@ -176,11 +176,6 @@ def _text(text: str) -> str:
 
 
 # ---------------------------------------------------------------------- bodies
-
-
-def _can_replay(run: Run) -> bool:
-    """True if there are bodies, and the motion of the log is known."""
-    return isinstance(run.result.model, MujocoModel) and run.view.diagnosis is not None
 
 
 def _send_replay(rerun: Any, recording: Any, above: list[str], run: Run) -> None:

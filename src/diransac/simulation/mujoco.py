@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.errors import SettingsError
 from diransac.model.mjcf.model import write
 from diransac.model.robots.description import mujoco_module, without_warnings
@@ -56,6 +56,7 @@ class MujocoRollouts(Simulator):
     def __init__(self, model: MujocoModel, signals: tuple[str, ...], hold: str) -> None:
         self.signals, self._model, self._hold = signals, model, hold
         self._columns = np.array([model.signals.index(n) for n in signals], int)
+        self._copies: list[Any] = []  # of MuJoCo's model, to write parameters in; as many as were needed so far
 
     # ------------------------------------------------------------------ the interface
 
@@ -290,8 +291,7 @@ class MujocoRollouts(Simulator):
         """States with unit quaternions."""
         found = states.copy()
         for four in self._model.quaternions:
-            size = np.linalg.norm(found[:, list(four)], axis=1, keepdims=True)
-            found[:, list(four)] /= np.where(size > 0.0, size, 1.0)
+            found[:, list(four)] /= size_or_one(np.linalg.norm(found[:, list(four)], axis=1, keepdims=True))
         return found
 
     def _inputs(self, batch: RolloutBatch, substeps: int) -> FloatArray:
@@ -313,11 +313,6 @@ class MujocoRollouts(Simulator):
         return dict.fromkeys((*model.state, *model.parameters), 1.0) | sizes
 
     # ------------------------------------------------------------------ MuJoCo's models
-
-    @cached_property
-    def _copies(self) -> list[Any]:
-        """Copies of MuJoCo's model, in which parameters are written; as many as were needed so far."""
-        return []
 
     def _models(self, parameters: FloatArray, step: float) -> list[Any]:
         """MuJoCo's model of each lane; lanes with the same parameters have one."""

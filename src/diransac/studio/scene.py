@@ -9,7 +9,6 @@ import json
 import multiprocessing
 import os
 import re
-import threading
 import tomllib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -21,6 +20,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
+from diransac.process import end_with_parent
 
 if TYPE_CHECKING:
     from diransac.data.log import Log
@@ -55,7 +55,7 @@ class Scenes:
         """
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_parent)
+            self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=end_with_parent)
         time = _moments(measured)
         columns = [_at(log, time) for log in (measured, predicted)]
         try:
@@ -93,18 +93,6 @@ def _at(log: Log | None, time: FloatArray) -> dict[str, FloatArray]:
 
 
 # ---------------------------------------------------------------------- in the other process
-
-
-def _end_with_parent() -> None:
-    """End this process with the page's, however that ends."""
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(0)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 def _content(

@@ -7,11 +7,8 @@ solvers swallow the interrupt and report that there is no plan.
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
 import random
 import signal
-import threading
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from diransac.errors import SettingsError, StudyError
-from diransac.process import module_path_safe
+from diransac.process import end_with_parent, module_path_safe
 from diransac.simulation import default_threads
 from diransac.study.store import Key, Store, Work
 from diransac.time_limit import time_left, time_limited
@@ -259,14 +256,7 @@ class _Begun(SpawnContext):
 def _begin() -> None:
     """Set up a worker process: it ignores Ctrl-C and ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    end_with_parent()
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.identification.method import Method
 from diransac.identification.methods import (
     ESTIMATORS,
@@ -20,7 +20,7 @@ from diransac.identification.methods import (
     factory,
 )
 from diransac.identification.settings import Settings
-from diransac.study.tables import OneOf, Table, Text
+from diransac.study.tables import OneOf, Table, Text, located
 
 TRUE = "true"
 """Method that identifies nothing: its parameters are the plant's own."""
@@ -61,9 +61,7 @@ class MethodChoice:
             The method has no such setting, or a value has no meaning.
         """
         own = default_options(self.method)
-        unknown = [name for name in self.options if name not in own]
-        if unknown:
-            raise SettingsError(f'there is no option "{unknown[0]}"; there are {", ".join(own) or "none"}')
+        check_known(self.options, own, "there is no option", "there are")
         inside = {}
         if self.estimator != _OWN_ESTIMATOR:
             if self.method not in WITH_ESTIMATOR:
@@ -107,11 +105,7 @@ def _method(label: str, table: object) -> MethodChoice:
     found = _MethodTable.model_validate(named, context={"place": place})
     # TOML has no None; "none" is a value of refit itself.
     given = {name: None if x == "none" and name != "refit" else x for name, x in found.settings.items()}
-    try:
+    with located(f"{place}.settings: "):
         settings = Settings.from_dict({**PRESETS[found.preset]().to_dict(), **given})
-    except SettingsError as error:
-        raise SettingsError(f"{place}.settings: {error}") from error
-    try:
+    with located(f"{place}: "):
         return MethodChoice(found.method, settings, found.options, found.estimator)
-    except SettingsError as error:
-        raise SettingsError(f"{place}: {error}") from error

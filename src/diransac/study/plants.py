@@ -54,14 +54,7 @@ def servo_axis(cogging: float = 0.0, parameters: Mapping[str, float] = PARAMETER
         # m, period of the cogging force.
         return {"position": d.cogging * cos(2 * pi * q.position / 0.024 + d.phase)}
 
-    cogs = Disturbance(
-        model,
-        "magnets",
-        forces=magnets,
-        constants={"cogging": cogging},
-        highest_frequency=40.0,
-        **_phases({"phase": 0.0}),
-    )
+    cogs = _vibration(model, "magnets", {"cogging": cogging}, 40.0, {"phase": 0.0}, forces=magnets)
     return Plant(model, parameters, (cogs,))
 
 
@@ -111,8 +104,7 @@ def _ripple(d: Symbols, angle: Any, phase: Any) -> Any:
 
 def _rippled(model: Model, name: str, ripple: float, phases: Sequence[str], **effect: Any) -> Disturbance:
     """Torque ripple, which integration steps resolve up to joint velocities of 10 rad/s, 200 Hz."""
-    states = _phases(dict.fromkeys(phases, 0.0))
-    return Disturbance(model, name, **effect, constants={"ripple": ripple}, highest_frequency=200.0, **states)
+    return _vibration(model, name, {"ripple": ripple}, 200.0, dict.fromkeys(phases, 0.0), **effect)
 
 
 def rotorcraft_in_gusts(
@@ -126,14 +118,9 @@ def rotorcraft_in_gusts(
         sizes = {"x": d.gusts, "z": d.gusts, "theta": d.moment_gusts}
         return {name: size * _sines(d, f"phase_{name}", rates) for name, size in sizes.items()}
 
-    air_in_motion = Disturbance(
-        model,
-        "air",
-        forces=air,
-        constants={"gusts": gusts, "moment_gusts": moment_gusts},
-        highest_frequency=max(rates),
-        **_turning({f"phase_{name}": rates for name in model.coordinates}),
-    )
+    turning = _turning({f"phase_{name}": rates for name in model.coordinates})
+    sizes = {"gusts": gusts, "moment_gusts": moment_gusts}
+    air_in_motion = _vibration(model, "air", sizes, max(rates), turning, forces=air)
     return Plant(model, parameters, (air_in_motion,))
 
 
@@ -158,14 +145,9 @@ def underwater_vehicle(
         through_water = v.x - d.current * _sines(d, "phase_current", of_current)
         return {"x": drag(v.x) - drag(through_water) + d.waves * _sines(d, "phase_waves", of_waves)}
 
-    water_in_motion = Disturbance(
-        model,
-        "water",
-        forces=water,
-        constants={"waves": waves, "current": current},
-        highest_frequency=max(of_waves),
-        **_turning({"phase_waves": of_waves, "phase_current": of_current}),
-    )
+    turning = _turning({"phase_waves": of_waves, "phase_current": of_current})
+    sizes = {"waves": waves, "current": current}
+    water_in_motion = _vibration(model, "water", sizes, max(of_waves), turning, forces=water)
     return Plant(model, parameters, (water_in_motion,))
 
 
@@ -174,18 +156,18 @@ def _sines(d: Symbols, name: str, frequencies: Sequence[float]) -> Any:
     return sqrt(2.0 / len(frequencies)) * sum(sin(d[f"{name}_{i}"]) for i in range(len(frequencies)))
 
 
-def _turning(groups: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """States ``name_i`` of a disturbance, the phases of sines with these frequencies, Hz."""
-    return _phases({f"{name}_{i}": 2 * pi * rate for name, some in groups.items() for i, rate in enumerate(some)})
+def _turning(groups: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Rates, rad/s, of the states ``name_i``, the phases of sines with these frequencies, Hz."""
+    return {f"{name}_{i}": 2 * pi * rate for name, some in groups.items() for i, rate in enumerate(some)}
 
 
-def _phases(rates: Mapping[str, float]) -> dict[str, Any]:
-    """States of a disturbance by their constant rates, rad/s; the seed of a flight draws each in a turn."""
-    return {
-        "states": dict.fromkeys(rates, "rad"),
-        "rates": lambda *_: dict(rates),
-        "start": dict.fromkeys(rates, (0.0, 2 * pi)),
-    }
+def _vibration(
+    model: Model, name: str, constants: Mapping[str, float], highest: float, rates: Mapping[str, float], **effect: Any
+) -> Disturbance:
+    """Disturbance of phases with constant rates, rad/s, up to a frequency, Hz; a flight's seed draws each phase."""
+    states, start = dict.fromkeys(rates, "rad"), dict.fromkeys(rates, (0.0, 2 * pi))
+    fixed: dict[str, Any] = {"constants": constants, "states": states, "rates": lambda *_: dict(rates), "start": start}
+    return Disturbance(model, name, highest_frequency=highest, **fixed, **effect)
 
 
 def _undisturbed(parameters: Mapping[str, float] = TABLE_I) -> Plant:

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from diransac.errors import DiransacError, SettingsError
+from diransac.errors import DiransacError, SettingsError, check_known
 from diransac.flight.noise import Noise
 from diransac.flight.planning import multisine, random_waypoints, sine, square, star
 from diransac.flight.planning.trajectories import MAX_DURATION, check_fully_actuated, check_plane
@@ -45,6 +45,7 @@ from diransac.study.tables import (
     flat,
     function_arguments,
     is_number,
+    located,
     takes_options,
     unknown_key,
 )
@@ -209,10 +210,8 @@ def _noise(table: object) -> Noise:
     for key in table:
         if key not in known:
             raise SettingsError(unknown_key("noise", key, known))
-    try:
+    with located("noise."):
         return Noise(**table)
-    except SettingsError as error:
-        raise SettingsError(f"noise.{error}") from error
 
 
 class Criteria(Table):
@@ -290,14 +289,10 @@ class Study(Table):
     def _can_be_flown(self) -> Self:
         missions = [("evaluation.trajectories", x, getattr(self.missions, x)) for x in self.evaluation.trajectories]
         for key, trajectory, arguments in [("data.trajectory", self.data.trajectory, self.data.arguments), *missions]:
-            try:
+            with located(f"{key} has {trajectory!r}: "):
                 _check_flown(trajectory, self.plant.plant.model, arguments)
-            except SettingsError as error:
-                raise SettingsError(f"{key} has {trajectory!r}: {error}") from error
-        try:
+        with located("control."):
             check_weights(self.plant.plant.model, **self.control.weights)
-        except SettingsError as error:
-            raise SettingsError(f"control.{error}") from error
         return self
 
     @classmethod
@@ -311,10 +306,8 @@ class Study(Table):
         """
         study = super().from_dict(table)
         for level in study.axis.levels:
-            try:
+            with located(f"axis: at level {level}, ", DiransacError):
                 study.at(level)
-            except DiransacError as error:
-                raise SettingsError(f"axis: at level {level}, {error}") from error
         return study
 
     @property
@@ -442,6 +435,4 @@ class Study(Table):
 def _check_flown(trajectory: str, model: Model, arguments: Mapping[str, Any]) -> None:
     """Raises SettingsError: no model of this structure can fly the trajectory, or it has no such input."""
     (check_fully_actuated if trajectory == "multisine" else check_plane)(model)
-    for name in arguments.get("input_weights", {}):
-        if name not in model.inputs:
-            raise SettingsError(f'input_weights names "{name}"; inputs are {", ".join(model.inputs)}')
+    check_known(arguments.get("input_weights", {}), model.inputs, "input_weights names", "inputs are")

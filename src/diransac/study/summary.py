@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +54,8 @@ class TrackingErrors:
 
     def median(self, state: str) -> FloatArray:
         """Median over trials, (n_levels, n_methods), infinite errors for failed ones; NaN without a trial."""
-        return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, _upper_median)
+        upper_median = partial(np.quantile, q=0.5, method="higher")  # infinities are not averaged with numbers
+        return _over_trials(np.where(self.failed, np.inf, self.errors[state]), self.ran, upper_median)
 
     def largest(self, state: str) -> FloatArray:
         """Largest error over trials, (n_levels, n_methods), infinite if one failed; NaN without a trial."""
@@ -196,8 +197,9 @@ def _summary(
     noted: Mapping[str, PlantFacts],
 ) -> Summary:
     """Summary of what a store holds.  Raises LookupError, TypeError, ValueError: its parts do not fit together."""
-    levels = _in_order(list(dict.fromkeys(level for level, _ in progress.cells)))
-    values = [value for value in map(_value, levels) if value is not None]
+    named = dict.fromkeys(level for level, _ in progress.cells)
+    values = [value for value in map(_value, named) if value is not None]
+    levels = tuple(named if len(values) < len(named) else sorted(named, key=float))
     if len(set(values)) < len(values):
         raise ValueError(f"levels {', '.join(levels)} have equal values")
     methods = tuple(dict.fromkeys(method for _, method in progress.cells))
@@ -208,6 +210,7 @@ def _summary(
     table = _Table(rows, levels, methods)
     seconds = rows.select("method", "seconds").unnest("seconds")
     stages = tuple(seconds.columns[1:])
+    failed = rows.filter(status="failed").select("method", "error").iter_rows()
     by_method = {method: seconds.filter(method=method).select(stages).sum().row(0) for method in methods}
     return Summary(
         **words,
@@ -217,7 +220,7 @@ def _summary(
         ran=table.ran,
         flights={shape: _flights(table, shape, list(units)) for shape in parts["study"]["evaluation.trajectories"]},
         estimates=_estimates(table, plants) if parts["study"].get("evaluation.parameters") else None,
-        failures=_failures(rows),
+        failures=dict(Counter((str(method), str(error)) for method, error in failed).most_common()),
         seconds=np.array(list(by_method.values()), dtype=float),
         stages=stages,
         versions=tuple(dict.fromkeys(rows["versions"])),
@@ -286,16 +289,6 @@ def _over_trials(values: FloatArray, counted: BoolArray, statistic: _Statistic) 
     return found
 
 
-def _failures(rows: pl.DataFrame) -> dict[tuple[str, str], int]:
-    failed = rows.filter(status="failed").select("method", "error").iter_rows()
-    return dict(Counter((str(method), str(error)) for method, error in failed).most_common())
-
-
-def _in_order(levels: Sequence[str]) -> tuple[str, ...]:
-    values = {level: _value(level) for level in levels}
-    return tuple(levels) if None in values.values() else tuple(sorted(levels, key=float))
-
-
 def _value(level: str) -> float | None:
     """Value of a level; None for a word."""
     try:
@@ -303,11 +296,6 @@ def _value(level: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
-
-
-def _upper_median(values: FloatArray) -> np.floating:
-    """Median; the upper one of an even number, so that infinities are not averaged with numbers."""
-    return np.float64(np.sort(values)[len(values) // 2])
 
 
 def _sample_deviation(values: FloatArray) -> np.floating:

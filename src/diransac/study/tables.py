@@ -9,6 +9,7 @@ import copy
 import inspect
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Self
 
@@ -29,7 +30,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
-from diransac.errors import SettingsError
+from diransac.errors import DiransacError, SettingsError
 from diransac.limits import MOST_COUNTED
 
 RANDOM = "random"
@@ -99,6 +100,15 @@ class Table(BaseModel):
     def to_dict(self) -> dict[str, Any]:
         """The table that `from_dict` takes, defaults included."""
         return self.model_dump(mode="json", by_alias=True)
+
+
+@contextmanager
+def located(place: str, error: type[DiransacError] = SettingsError) -> Iterator[None]:
+    """Context that writes a place before the message of an error of a class, and makes it a SettingsError."""
+    try:
+        yield
+    except error as found:
+        raise SettingsError(f"{place}{found}") from found
 
 
 def unknown_key(place: str, key: str, known: Collection[str]) -> str:

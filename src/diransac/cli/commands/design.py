@@ -50,15 +50,15 @@ class DesignOptions:
     ] = None
     noise: Annotated[
         list[str] | None,
-        typer.Option("--noise", metavar="NAME=SD,...", help="Noise of signals; by default 1 % of inputs; {} as above."),
+        typer.Option(metavar="NAME=SD,...", help="Noise of signals; by default 1 % of inputs; {} as above."),
     ] = None
     duration: Annotated[float, typer.Option(metavar="S", help="Duration.")] = 20.0
     frequency: Annotated[float, typer.Option(metavar="HZ", help="Highest frequency.")] = 1.0
     rate: Annotated[float, typer.Option(metavar="HZ", help="Rows per second.")] = 100.0
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same motion.")] = 0
-    time_limit: Annotated[
-        float, typer.Option("--time-limit", metavar="S", help="End the search of a limb after so many seconds.")
-    ] = 60.0
+    time_limit: Annotated[float, typer.Option(metavar="S", help="End the search of a limb after so many seconds.")] = (
+        60.0
+    )
 
     def numbers_of(self) -> dict[str, Any]:
         """Arguments of `diransac.design_experiment` that are numbers."""

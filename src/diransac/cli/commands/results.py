@@ -71,7 +71,7 @@ def _predict(
         float | None, typer.Option(metavar="S", help="Restart from the log's states after so long.")
     ] = None,
     initial: Annotated[
-        list[str] | None, typer.Option("--initial", metavar="NAME=VALUE,...", help="Initial states: x=0,x_dot=0.")
+        list[str] | None, typer.Option(metavar="NAME=VALUE,...", help="Initial states: x=0,x_dot=0.")
     ] = None,
     plot: FlightPicture = None,
 ) -> None:
@@ -136,13 +136,13 @@ def _export(
         ),
     ],
     into: Annotated[
-        Path | None, typer.Option("--into", metavar="FILE.xml|FILE.urdf", help="A robot's description to calibrate.")
+        Path | None, typer.Option(metavar="FILE.xml|FILE.urdf", help="A robot's description to calibrate.")
     ] = None,
     to: Annotated[
-        str | None, typer.Option("--to", metavar="c|python|casadi|yaml|mjcf|urdf", help="Format, if not by the ending.")
+        str | None, typer.Option(metavar="c|python|casadi|yaml|mjcf|urdf", help="Format, if not by the ending.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--name", metavar="NAME", help="Beginning of C's functions, if not the model's name.")
+        str | None, typer.Option(metavar="NAME", help="Beginning of C's functions, if not the model's name.")
     ] = None,
 ) -> None:
     """Write an identified model for other programs, or a robot's description with the identified values in it."""

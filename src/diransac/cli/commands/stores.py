@@ -56,9 +56,7 @@ def _run(
     ] = None,
     jobs: Jobs = None,
     cluster: Cluster = None,
-    time_limit: Annotated[
-        float | None, typer.Option("--time-limit", metavar="S", help="End the run after so many seconds.")
-    ] = None,
+    time_limit: Annotated[float | None, typer.Option(metavar="S", help="End the run after so many seconds.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run the trials that a store lacks; after an interruption, the same command runs the rest."""

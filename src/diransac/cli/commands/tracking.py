@@ -57,7 +57,7 @@ class TrackerOptions:
     ] = None
     fixed: FixedParameters = None
     false_alarms: Annotated[
-        float, typer.Option("--false-alarms", metavar="N", help="Changes per hour of a machine that does not change.")
+        float, typer.Option(metavar="N", help="Changes per hour of a machine that does not change.")
     ] = 0.1
     seed: Seed = 0
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, size_or_one
 from diransac.data.checks import ROUNDING
 from diransac.data.filters import median_filter, mirrored_windows
 from diransac.data.units import one_turn
@@ -263,8 +263,7 @@ def whole_quaternions(names: Container[str], model: Model) -> list[list[str]]:
 
 def unit_quaternions(q: FloatArray) -> FloatArray:
     """Quaternions ``(N, 4)`` scaled to unit norm; those of norm zero are left as they are."""
-    norms = np.linalg.norm(q, axis=1, keepdims=True)
-    return q / np.where(norms > 0.0, norms, 1.0)
+    return q / size_or_one(np.linalg.norm(q, axis=1, keepdims=True))
 
 
 def continuous_quaternions(q: FloatArray) -> FloatArray:

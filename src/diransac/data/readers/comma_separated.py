@@ -70,8 +70,11 @@ def read_csv(data: bytes, source: str, names: Sequence[str] | None = None, repai
     Raises LogError: the data are not UTF-8 text with a header line and as many fields in every line, or too large.
     """
     repairs = Repairs() if repairs is None else repairs
-    lines, notes = _lines(data, source)
-    metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if _is_metadata(lines[0]) else None
+    text, notes = _text(data, source)
+    check_size(source, text.count("\n"), 1)
+    lines = text.split("\n")
+    has_metadata = lines[0].lstrip('"').startswith(COMMENT)  # spreadsheets put quotation marks around it
+    metadata = lines.pop(0).strip('"').removeprefix(COMMENT) if has_metadata else None
     lines = _without_comments(_with_bare_header(lines) if names is None else lines, repairs)
     lines, skipped = _without_preamble(lines, repairs)
     if not lines:
@@ -250,11 +253,6 @@ def _without_ragged(lines: list[str], separator: str, repairs: Repairs, source: 
     return kept
 
 
-def _is_metadata(line: str) -> bool:
-    """True for a first line with metadata, also between the quotation marks that spreadsheets put around it."""
-    return line.lstrip('"').startswith(COMMENT)
-
-
 def _decoded(data: bytes, source: str) -> tuple[str, list[str]]:
     """Text in UTF-8, else in UTF-16 by its mark or in the code of Windows, with a note."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -281,13 +279,6 @@ def _text(data: bytes, source: str) -> tuple[str, list[str]]:
     if not text.strip():
         raise LogError(f"{source}: it is empty; give a header line and one line per row")
     return text, notes
-
-
-def _lines(data: bytes, source: str) -> tuple[list[str], list[str]]:
-    """Lines of the text, and notes on it.  Raises LogError: as `_text`, or there are too many."""
-    text, notes = _text(data, source)
-    check_size(source, text.count("\n"), 1)
-    return text.split("\n"), notes
 
 
 def _separator(header: str) -> str:

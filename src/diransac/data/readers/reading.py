@@ -147,7 +147,8 @@ class Reading:
         if isinstance(opened, Table):
             opened = opened if columns is None else opened.with_step({"step": "columns", "names": list(columns)})
             table = repairs.in_si(_with_clock(opened, self._chosen("rate", earlier), source))
-            new_names = _stripped(self.rename, table)
+            # Without the unit that the header of a column may have.
+            new_names = {n: old if old in table.columns else split_unit(old)[0] for n, old in self.rename.items()}
             rename = {**earlier._names(table, new_names.values()), **new_names}
             if mapping is None or mapping.time_column is None:
                 rename = _with_time(rename, table)
@@ -264,11 +265,6 @@ def _with_clock(table: Table, rate: float | None, source: str) -> Table:
     columns: dict[str, FloatArray | str] = {"t": np.arange(table.n_rows) / rate, **table.columns}
     clocked = replace(table, columns=columns, units={**table.units, "t": "s"})
     return clocked.with_step({"step": "clock", "rate": float(rate)})
-
-
-def _stripped(rename: Mapping[str, str], table: Table) -> dict[str, str]:
-    """New name -> name of a column, without the unit that its header may have."""
-    return {new: split_unit(old)[0] if old not in table.columns else old for new, old in rename.items()}
 
 
 def _with_time(rename: Mapping[str, str], table: Table) -> dict[str, str]:

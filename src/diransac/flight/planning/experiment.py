@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.errors import PlanningError, SettingsError
+from diransac.errors import PlanningError, SettingsError, check_known
 from diransac.flight.planning.excitation import (
     FourierSeries,
     Limit,
@@ -421,9 +421,8 @@ def _noise_of(machine: _Machine, noise: Mapping[str, float] | None, motions: Flo
         # Default standard deviation of an input's noise, over what the input varies by.
         return dict(zip(model.inputs, (0.01 * spread).tolist(), strict=True))
     names = (*model.state, *model.accelerations, *model.inputs)
+    check_known(noise, names, "noise: there is no signal", "there are")
     for name, value in noise.items():
-        if name not in names:
-            raise SettingsError(f'noise: there is no signal "{name}"; there are {", ".join(names)}')
         if not (np.ndim(value) == 0 and 0.0 < value < np.inf):
             raise SettingsError(f'noise: "{name}" is {value!r:.60}; give a positive standard deviation')
     return {name: float(value) for name, value in noise.items()}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.data.preprocessing.continuity import unit_quaternions
 from diransac.errors import PlanningError, SettingsError
 from diransac.flight.planning.solver import TIME_LIMIT, Solution, Strategy, interior_point
 from diransac.flight.planning.task import TIME_STEP, Reference, Task, sampled, task_of
@@ -219,8 +220,7 @@ def _straight(task: Task, durations: FloatArray) -> Guess:
         elif known.any():
             states[:, j] = np.interp(time, at_waypoints[known], fixed[known, j])
     for four in model.quaternions:
-        lengths = np.linalg.norm(states[:, list(four)], axis=1, keepdims=True)
-        states[:, list(four)] /= np.where(lengths > 0.0, lengths, 1.0)
+        states[:, list(four)] = unit_quaternions(states[:, list(four)])
     return time, states, np.broadcast_to(task.trim, (len(time), len(task.trim)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.errors import PlanningError, SettingsError
+from diransac.errors import PlanningError, SettingsError, check_known
 from diransac.flight.trajectory import InputLimits, half_ranges
 
 if TYPE_CHECKING:
@@ -188,8 +188,7 @@ def _route(
 
     Raises SettingsError: arguments that are missing or exclude each other, or values without meaning.
     """
-    for name in reference or {}:
-        _check_known("reference", "state", name, model.state)
+    check_known(reference or {}, model.state, "reference: there is no state", "there are")
     if waypoints is None:
         if reference is None:
             raise SettingsError("a plan needs waypoints=, or reference= with duration=")
@@ -282,8 +281,8 @@ def _check_within(model: Model, waypoints: Sequence[Waypoint], limits: Limits) -
 def _limits_of(what: str, limits: InputLimits | None, names: Sequence[str]) -> Limits:
     """Limits (n,) from limits by name.  Raises SettingsError: an unknown name, or no pair in increasing order."""
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    check_known(limits or {}, names, f"{what}_limits: there is no {what}", "there are")
     for name, pair in (limits or {}).items():
-        _check_known(f"{what}_limits", what, name, names)
         if np.shape(pair) != (2,) or not pair[0] <= pair[1]:
             raise SettingsError(f'{what}_limits of "{name}" must be (lowest, highest); found {pair!r}')
         lower[names.index(name)], upper[names.index(name)] = pair
@@ -304,19 +303,14 @@ def _weights_of(
 
 def _named_values(what: str, kind: str, values: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
     """Values by name as finite floats.  Raises SettingsError: an unknown name, or a value that is no finite number."""
+    check_known(values, names, f"{what}: there is no {kind}", "there are")
     found = {}
     for name, value in values.items():
-        _check_known(what, kind, name, names)
         number = np.asarray(value)
         if number.shape != () or number.dtype.kind not in "fiu" or not np.isfinite(number):
             raise SettingsError(f'{what}: "{name}" is {value!r}; give a finite number')
         found[name] = float(number)
     return found
-
-
-def _check_known(what: str, kind: str, name: str, names: Iterable[str]) -> None:
-    if name not in names:
-        raise SettingsError(f'{what}: there is no {kind} "{name}"; there are {", ".join(names)}')
 
 
 # Trim ----------------------------------------------------------------------------------------------------------------

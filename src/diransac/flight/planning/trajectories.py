@@ -398,8 +398,7 @@ def inverse_dynamics(model: Model) -> ca.Function:
 
     Raises SettingsError: they do not determine the inputs linearly and uniquely.
     """
-    sizes = model.n_q, model.n_v, model.n_v, model.n_u, model.n_p
-    q, v, a, u, p = (ca.SX.sym(name, size) for name, size in zip("qvaup", sizes, strict=True))
+    q, v, a, u, p = (ca.SX.sym(n, size) for n, size in model.argument_sizes.items())
     r = model.residual(q, v, a, u, p)
     input_matrix = ca.jacobian(r, u)
     is_square = model.kinematics is None and model.n_u == model.n_v and not model.first_order

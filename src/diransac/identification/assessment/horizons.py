@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, runs
+from diransac.arrays import BoolArray, FloatArray, IntArray, interpolated, runs, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
 from diransac.errors import LogError
@@ -215,8 +215,7 @@ class OpenLoop:
 
     def filled_states(self) -> FloatArray:
         """States ``(N, n_x)`` at all rows, interpolated where there is none."""
-        rows = np.arange(len(self.states))
-        return np.column_stack([np.interp(rows, rows[np.isfinite(x)], x[np.isfinite(x)]) for x in self.states.T])
+        return interpolated(self.states)
 
     def window_rows(self, steps: int) -> list[tuple[slice, IntArray]]:
         """First rows of windows of so many samples, one after another, and of the rest, in each stretch."""
@@ -424,15 +423,14 @@ def _unmeasured(
     segment: Segment, layout: ParameterLayout, parameters: FloatArray, states: FloatArray, hidden: tuple[str, ...]
 ) -> FloatArray:
     """States ``(N, n)`` that the log lacks, whose initial values agree best with the other velocities and sensors."""
-    model, rows = segment.model, np.arange(len(segment))
-    known = np.column_stack([np.interp(rows, rows[np.isfinite(x)], x[np.isfinite(x)]) for x in states.T])
+    model, known = segment.model, interpolated(states)
     observed = [i for i, n in enumerate(model.state) if n in model.velocities and n not in hidden]
     absent = np.full(len(segment), np.nan)
     sensors = [segment.column(n) if n in segment.present else absent for n in model.sensors]
     compared = np.column_stack([states[:, observed], *sensors])
     seen = np.isfinite(compared)
     spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
-    weights = np.where(seen, 1.0 / np.square(np.where(spread > 0.0, spread, 1.0)), 0.0)
+    weights = np.where(seen, 1.0 / np.square(size_or_one(spread)), 0.0)
     readings = np.nan_to_num(compared[:, len(observed) :])
     # The observers forget within a twentieth of the log.
     bandwidth = 1.0 / (0.05 * len(segment) * segment.log.dt)

@@ -21,7 +21,7 @@ from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.regression.uncertainty import jackknife_covariance
 from diransac.identification.settings import Settings
 from diransac.identification.structure.columns import contradictions
-from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
+from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
 from diransac.identification.structure.structural import structural
@@ -345,7 +345,7 @@ def _excitation(model: Model, logs: Sequence[Log]) -> tuple[dict[str, Excitation
     check_motion(dataset)
     ambiguous = structural(model, ranges=dataset.ranges)
     if ambiguous:
-        return _not_excited(ambiguous, model.parameters), "; ".join(x.sentence(x.of_equations()) for x in ambiguous)
+        return _not_excited(ambiguous, model.parameters), equations_in_words(ambiguous)
     bound, layout = OrdinaryLeastSquares().bind(dataset), dataset.layout
     own = dict(zip(layout.names, layout.bounds, strict=True))
     rows = np.arange(bound.n_rows)

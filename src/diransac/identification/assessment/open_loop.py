@@ -12,7 +12,7 @@ from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.data.segment import Segment
-from diransac.errors import LogError, ResultError, SettingsError
+from diransac.errors import LogError, ResultError, SettingsError, check_known
 from diransac.identification.assessment.horizons import derived_velocities
 from diransac.identification.assessment.window_starts import smoothed_log
 from diransac.identification.diagnosis import Diagnosis, Resolution
@@ -102,9 +102,7 @@ def resolution_of(
 
 def _with_start(log: Log, model: Model, given: Mapping[str, float]) -> Log:
     """A log of the inputs and of constant states: the given ones, elsewhere the log's first samples."""
-    unknown = [name for name in given if name not in model.state]
-    if unknown:
-        raise SettingsError(f'initial_state names "{unknown[0]}"; the state is {", ".join(model.state)}')
+    check_known(given, model.state, "initial_state names", "the state is")
     known = {name: finite_number(f"initial_state: {name}", value) for name, value in given.items()}
     start = {name: known[name] if name in known else _first(log, name) for name in model.state}
     absent = [name for name, value in start.items() if not np.isfinite(value)]

@@ -93,17 +93,17 @@ class Validation:
     @property
     def rmse(self) -> Mapping[str, float]:
         """Root mean squared error of each signal, in its unit."""
-        return self.horizons[self.asked].rmse
+        return self.judged.rmse
 
     @property
     def fit_percent(self) -> Mapping[str, float]:
         """``100 (1 - |y - y_sim| / |y - mean(y)|)`` of each signal."""
-        return self.horizons[self.asked].fit_percent
+        return self.judged.fit_percent
 
     @property
     def r_squared(self) -> Mapping[str, float]:
         """Coefficient of determination of each signal."""
-        return self.horizons[self.asked].r_squared
+        return self.judged.r_squared
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON (a figure that is not finite becomes null)."""

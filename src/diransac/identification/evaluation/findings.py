@@ -46,7 +46,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
             *mistakes,
             *result.estimate.checks,
             *_logs(result),
-            *_suggested(result),
+            *(Finding("care", f"The model seems to lack a term. {x.text}", _added(x)) for x in result.suggestions),
             *_bounds(result),
             *_diagnosis(result),
             *_bodies(result),
@@ -160,12 +160,6 @@ def _remedy(result: Result, level: Level = "care") -> str:
 def _added(suggestion: Suggestion) -> str:
     """The action that adds a suggested term."""
     return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
-
-
-def _suggested(result: Result) -> Iterator[Finding]:
-    """The terms that the model lacks."""
-    for x in result.suggestions:
-        yield Finding("care", f"The model seems to lack a term. {x.text}", _added(x))
 
 
 def _simulation(result: Result) -> Iterator[Finding]:

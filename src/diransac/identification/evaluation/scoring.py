@@ -113,7 +113,9 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
                 f"{dataset.source}: {', '.join(scales)} are constant; nothing moves in this log. Record a motion"
             )
         moving = {n: scale for n, scale in scales.items() if scale > 0.0}
-        slow = _with_accelerations(dataset.model)
+        model = dataset.model
+        sensors = [n for n, used in model.sensor_arguments.items() if not set(used).isdisjoint(model.accelerations)]
+        slow = (*model.accelerations, *sensors)
         if weights is None:
             weights = {n: (0.1 if n in slow else 1.0) / x for n, x in moving.items()}
         if thresholds is None:
@@ -132,12 +134,6 @@ def choose_scoring(dataset: Dataset, settings: Settings) -> Scoring:
     notes = [f"{n} is constant and is not compared" for n in constant]
     notes.append(f"a row is an inlier if {needed} of {n_signals} signals are within their thresholds: {compared}")
     return Scoring(w, eps, needed, tuple(notes))
-
-
-def _with_accelerations(model: Model) -> tuple[str, ...]:
-    """Names of the accelerations, and of the sensors that depend on them."""
-    sensors = [n for n, used in model.sensor_arguments.items() if not set(used).isdisjoint(model.accelerations)]
-    return (*model.accelerations, *sensors)
 
 
 # ---------------------------------------------------------------------- simulation

@@ -15,7 +15,7 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.identification.settings import EXECUTION, Settings
 
 if TYPE_CHECKING:
@@ -67,8 +67,7 @@ def factory(name: str) -> Callable[..., Method]:
     SettingsError
         There is no method of that name; the message lists all.
     """
-    if name not in _REGISTRY:
-        raise SettingsError(f'there is no method "{name}"; there are {", ".join(METHODS)}')
+    check_known([name], METHODS, "there is no method", "there are")
     found: Callable[..., Method] = _imported(f"methods.{_REGISTRY[name]}")
     return found
 

@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, null_space, regression
@@ -238,8 +238,7 @@ class BoundSums:
         self._estimator = estimator
         self.n_rows, self._n_equations, self._n_p = W.shape
         columns = np.concatenate([W, b[:, :, None]], axis=2)
-        size = np.sqrt(np.square(columns.reshape(-1, self._n_p + 1)).mean(axis=0))
-        self.scale = np.where(size > 0.0, size, 1.0)
+        self.scale = size_or_one(np.sqrt(np.square(columns.reshape(-1, self._n_p + 1)).mean(axis=0)))
         columns = columns / self.scale
         self._upper = np.triu_indices(self._n_p + 1)
         i, j = self._upper

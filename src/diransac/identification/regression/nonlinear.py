@@ -18,7 +18,7 @@ from itertools import chain
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.log import Log
 from diransac.data.segment import Segment
@@ -136,7 +136,7 @@ class BoundNonlinear:
         errors, J = self.errors(everything, whole)
         errors, J = errors.reshape(self.n_rows, len(self._scale)), J.reshape(self.n_rows, len(self._scale), -1)
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
-        J = J / np.where(scale > 0.0, scale, 1.0)
+        J = J / size_or_one(scale)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
         self._column_scale = scale / self.chart.slope(whole)[0]
         if len(self._layout.with_prior):
@@ -386,8 +386,8 @@ def _solution_of_affine_part(dataset: Dataset) -> tuple[BoolArray, FloatArray]:
     W, b = regression(dataset)
     rows = W.reshape(-1, W.shape[2])
     scale = np.abs(rows).max(axis=0)
-    solved = np.linalg.lstsq(rows / np.where(scale > 0.0, scale, 1.0), b.ravel(), rcond=None)[0]
-    return scale > 0.0, solved / np.where(scale > 0.0, scale, 1.0)
+    solved = np.linalg.lstsq(rows / size_or_one(scale), b.ravel(), rcond=None)[0]
+    return scale > 0.0, solved / size_or_one(scale)
 
 
 class ParameterChart:

@@ -28,7 +28,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray, size_or_one
 from diransac.data.dataset import ParameterLayout
 from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.nonlinear import ParameterChart
@@ -228,7 +228,7 @@ class ObserverFit:
     def _on_stretches(self, part: float) -> ObserverFit:
         """The same on a part of each log, in which its inputs change most; samples are where states start from."""
         rows_of_logs, begin, size = [], self.begin.copy(), self.inputs.std(axis=0)
-        steps = np.square(np.diff(self.inputs, axis=0) / np.where(size > 0.0, size, 1.0)).sum(axis=1)
+        steps = np.square(np.diff(self.inputs, axis=0) / size_or_one(size)).sum(axis=1)
         steps *= self._near_samples[1:]
         states = [self.observer.state.index(n) for n in self.compared]
         sampled = [(i, j) for j, i in enumerate(states) if i < len(self.found)]
@@ -378,7 +378,7 @@ def observers(
 @lru_cache(maxsize=64)
 def _free_of_turns(model: Model) -> frozenset[str]:
     """Coordinates in rad that may gain a whole turn with no effect on the equations, tried at random points."""
-    symbols = [ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup")]
+    symbols = [ca.SX.sym(n, size) for n, size in model.argument_sizes.items()]
     parts = [model.residual(*symbols)]
     if model.kinematics is not None:
         parts.append(model.kinematics(*symbols[:2]))

@@ -14,7 +14,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
@@ -107,7 +107,7 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
         return None
     scale = np.sqrt(np.square(rows).mean(axis=0))
     has_known_terms = bool(scale[-1] > 0.0)
-    scale = np.where(scale > 0.0, scale, 1.0)
+    scale = size_or_one(scale)
     rows = rows / scale
     A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
     weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
@@ -123,8 +123,7 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     sizes = (np.median(x.reshape(-1, n_equations), axis=0) + _TINY for x in (residuals, whole))
     # The information at the solution: rows that are outliers there inform of nothing.
     weighted = A * weights[:, None]
-    size = np.sqrt(np.square(weighted).mean(axis=0))
-    size = np.where(size > 0.0, size, 1.0)
+    size = size_or_one(np.sqrt(np.square(weighted).mean(axis=0)))
     units = scale[-1] / scale[:-1]
     # A residual of a millionth of the terms is exact.
     return Solution(
@@ -173,12 +172,11 @@ def _sizes(rows: FloatArray) -> FloatArray:
     known = size > 0.0
     if known.any() and not known.all():
         A, y = ((x[:, known] / size[known, None]).reshape(-1, x.shape[2]) for x in (W, rows[:, :, -1:]))
-        column = np.sqrt(np.square(A).mean(axis=0))
-        column = np.where(column > 0.0, column, 1.0)
+        column = size_or_one(np.sqrt(np.square(A).mean(axis=0)))
         p = np.linalg.lstsq(A / column, y[:, 0], rcond=None)[0] / column
         size = np.where(known, size, np.median(np.abs(W) @ np.abs(p), axis=0))
     whole = np.median(np.abs(rows).sum(axis=2), axis=0)
-    return np.where(size > 0.0, size, np.where(whole > 0.0, whole, 1.0))
+    return np.where(size > 0.0, size, size_or_one(whole))
 
 
 def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
@@ -218,9 +216,9 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
     J = np.concatenate(parts)
     J = J[np.isfinite(J).all(axis=(1, 2))]
     size = np.median(np.abs(J).max(axis=2), axis=0) if len(J) else np.ones(J.shape[1])
-    A = (J / np.where(size > 0.0, size, 1.0)[:, None]).reshape(-1, J.shape[2])
+    A = (J / size_or_one(size)[:, None]).reshape(-1, J.shape[2])
     norms = np.linalg.norm(A, axis=0)
-    A = A / np.where(norms > 0.0, norms, 1.0)
+    A = A / size_or_one(norms)
     pairs = ((A[:, k], np.delete(A, k, axis=1)) for k in range(A.shape[1]))
     free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in pairs]
     # Equations inform about a parameter if the other columns leave a tenth of its own.
@@ -351,7 +349,7 @@ def null_space(gram: FloatArray, scale: FloatArray, threshold: float) -> NullSpa
     if not np.isfinite(gram).all():
         raise np.linalg.LinAlgError("the information matrix is not finite")
     sizes, vectors = np.linalg.eigh(gram)
-    return NullSpace(vectors[:, sizes <= threshold].T, np.where(scale > 0.0, scale, 1.0))
+    return NullSpace(vectors[:, sizes <= threshold].T, size_or_one(scale))
 
 
 @lru_cache(maxsize=64)
@@ -362,7 +360,7 @@ def residual_slopes(model: Model) -> ca.Function:
     ----------
     model : Model
     """
-    symbols = [ca.SX.sym(name, model.residual.size1_in(i)) for i, name in enumerate("qvaup")]
+    symbols = [ca.SX.sym(n, size) for n, size in model.argument_sizes.items()]
     outputs = model.residual(*symbols)
     if model.measurement is not None:
         outputs = ca.vertcat(outputs, model.measurement(*symbols))

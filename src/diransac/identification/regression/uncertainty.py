@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.errors import ResultError
+from diransac.errors import ResultError, SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Parameter
@@ -178,6 +178,16 @@ def students_draws(
                 "or fix the parameters that are uncertain"
             )
     return kept[:, :n]
+
+
+def two_sided(
+    level: float, quantile: Callable[[float], float], values: Mapping[str, float], errors: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Interval of each value at a level.  Raises SettingsError: the level is not between 0 and 1."""
+    if not 0.0 < level < 1.0:
+        raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
+    width = quantile(0.5 + level / 2.0)
+    return {n: (x - width * errors[n], x + width * errors[n]) for n, x in values.items()}
 
 
 @lru_cache(maxsize=256)

@@ -224,7 +224,7 @@ def candidate_terms(
     ModelError
         The user's library fails, or returns a name that cannot be that of a parameter.
     """
-    symbols = tuple(ca.SX.sym(n, model.residual.size1_in(i)) for i, n in enumerate("qvaup"))
+    symbols = tuple(ca.SX.sym(n, size) for n, size in model.argument_sizes.items())
     maker = _Maker(model, symbols, speeds, inputs)
     terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
     terms += [x for one in relative for x in maker.between(one)]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.identification.regression.rows import PART_OF_NULL_VECTOR, NullSpace
 
 # Largest difference of equal projectors.
@@ -97,6 +97,11 @@ class Ambiguity:
 # ---------------------------------------------------------------------- ambiguities of the equations
 
 
+def equations_in_words(found: Sequence[Ambiguity]) -> str:
+    """A sentence on each ambiguity of the equations."""
+    return "; ".join(x.sentence(x.of_equations()) for x in found)
+
+
 def joined(found: Sequence[Ambiguity]) -> tuple[Ambiguity, ...]:
     """Ambiguities, with all parameters that are in no combination as one."""
     alone = tuple(name for x in found if not x.n_determined for name in x.names)
@@ -141,8 +146,7 @@ def _echelon(rows: FloatArray) -> FloatArray:
     """Reduced row echelon form whose pivots are in the last columns, so that the first parameters are shared."""
     if not len(rows):
         return rows
-    size = np.abs(rows).max(axis=0)
-    size = np.where(size > 0.0, size, 1.0)
+    size = size_or_one(np.abs(rows).max(axis=0))
     A, done = (rows / size)[:, ::-1].copy(), 0
     for column in range(A.shape[1]):
         pivot = done + int(np.argmax(np.abs(A[done:, column])))

@@ -22,7 +22,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.dataset import ParameterLayout
-from diransac.errors import SettingsError
+from diransac.errors import SettingsError, check_known
 from diransac.identification.regression.uncertainty import combined
 from diransac.identification.settings import finite_number
 from diransac.identification.structure.lacking_terms import Suggestion
@@ -197,14 +197,8 @@ def _as_mapping(fixed: object) -> Mapping[str, object]:
     return dict.fromkeys(fixed)
 
 
-def _check_name(model: Model, name: object, what: str) -> None:
-    if name not in model.parameters:
-        known = ", ".join(model.parameters)
-        raise SettingsError(f'{what}: model "{model.name}" has no parameter "{name}"; it has {known}')
-
-
 def _fixed_value(model: Model, name: str, value: object) -> float:
-    _check_name(model, name, "fixed")
+    check_known([name], model.parameters, f'fixed: model "{model.name}" has no parameter', "it has")
     bounds = model.parameters[name]
     if value is None:
         if bounds.value is None:
@@ -217,7 +211,7 @@ def _fixed_value(model: Model, name: str, value: object) -> float:
 
 
 def _prior(model: Model, name: str, pair: object) -> tuple[float, float]:
-    _check_name(model, name, "priors")
+    check_known([name], model.parameters, f'priors: model "{model.name}" has no parameter', "it has")
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise SettingsError(f"the prior of {name} is {pair!r:.60}; give its mean and standard deviation")
     mean = finite_number(f"the prior mean of {name}", pair[0])

@@ -348,7 +348,6 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
     """
     results = {"h": model.n_v}
     terms = [expressions.restored("term", x.term, model.argument_sizes, results) for x in suggestions]
-    derived = model.kinematics is None
 
     def arguments(q, v, a, u, p):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
         return [*(ca.vertcat(*x) for x in (q, v, a, u)), ca.vertcat(*(p[n] for n in model.parameters))]
@@ -358,21 +357,7 @@ def with_terms(model: Model, suggestions: Sequence[Suggestion]) -> Model:
         added = [p[x.parameter] * h(*own) for x, h in zip(suggestions, terms, strict=True)]
         return list(ca.vertsplit(sum(added, model.residual(*own))))
 
-    def kinematics(q, v):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-        assert model.kinematics is not None
-        return list(ca.vertsplit(model.kinematics(ca.vertcat(*q), ca.vertcat(*v))))
-
     new = {x.parameter: Parameter(x.unit or "1") for x in suggestions}
     names = ", ".join(x.parameter for x in suggestions)
-    return Model(
-        f"{model.name} with {names}",
-        model.coordinates,
-        model.inputs,
-        {**model.parameters, **new},
-        equations,
-        velocities=None if derived else model.velocities_of_motion,
-        kinematics=None if derived else kinematics,
-        first_order=model.first_order,
-        sensors=model.sensors_of(arguments),
-        description=model.description,
-    )
+    sensors = model.sensors_of(arguments)
+    return model.with_equations(f"{model.name} with {names}", {**model.parameters, **new}, equations, sensors)

@@ -19,7 +19,7 @@ from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.structure.columns import explanations
-from diransac.identification.structure.identifiability import Ambiguity, in_words, of_log
+from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
 from diransac.model import Model
 
@@ -105,7 +105,7 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     of_model = structural(model, ranges=_ranges(model, logs))
     found = None if model.nonlinear_parameters else solved(model, layout, logs)
     if any(x.noun == "ratio" for x in of_model) or (found is None and of_model):
-        return "; ".join(x.sentence(x.of_equations()) for x in of_model)
+        return equations_in_words(of_model)
     if found is None:
         if model.nonlinear_parameters:
             why = "no simulation within the bounds follows the log"
@@ -127,7 +127,7 @@ def _ranges(model: Model, logs: Sequence[MotionRows]) -> Ranges:
 def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: Solution, of_model: Sequence[Ambiguity]) -> str:
     """The cause where least squares of all rows has a solution: ambiguities, bounds, or noise."""
     if of_model:
-        return "; ".join(x.sentence(x.of_equations()) for x in of_model)
+        return equations_in_words(of_model)
     of_rows = in_words(of_log(layout.names, found.space), n_logs)
     if of_rows:
         return of_rows

@@ -15,7 +15,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, residual_slopes
@@ -24,6 +24,7 @@ from diransac.identification.structure.identifiability import (
     ambiguity_of,
     collinear,
     components,
+    equations_in_words,
     in_words,
     joined,
     of_logs,
@@ -135,7 +136,7 @@ def check_structure(
     """
     found = structural(model, measured, ranges)
     if sum(len(x.names) for x in found) > allow:
-        raise IdentificationError(f"{source}: {'; '.join(x.sentence(x.of_equations()) for x in found)}")
+        raise IdentificationError(f"{source}: {equations_in_words(found)}")
 
 
 def structural_slopes(model: Model, parameters: FloatArray, given: IntArray) -> FloatArray:
@@ -248,8 +249,7 @@ def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatAr
 
 def _null_space(J: FloatArray, rank: float) -> NullSpace:
     """Null space of the rows of J, with columns of unit norm; singular values below ``rank`` are zero."""
-    norms = np.linalg.norm(J, axis=0)
-    scale = np.where(norms > 0.0, norms, 1.0)
+    scale = size_or_one(np.linalg.norm(J, axis=0))
     _, sizes, rows = np.linalg.svd(J / scale, full_matrices=False)
     return NullSpace(rows[sizes <= rank * sizes.max(initial=0.0)], scale)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.errors import SettingsError
+from diransac.identification.regression.uncertainty import two_sided
 from diransac.text_table import number
 
 if TYPE_CHECKING:
@@ -102,11 +102,7 @@ class TrackedEstimate:
         SettingsError
             The level is not between 0 and 1.
         """
-        if not 0.0 < level < 1.0:
-            raise SettingsError(f"level is {level}; give a number between 0 and 1, such as 0.95")
-        width = NormalDist().inv_cdf(0.5 + level / 2.0)
-        errors = self.standard_errors
-        return {n: (x - width * errors[n], x + width * errors[n]) for n, x in self.parameters.items()}
+        return two_sided(level, NormalDist().inv_cdf, self.parameters, self.standard_errors)
 
 
 class History:

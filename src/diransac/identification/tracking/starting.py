@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diransac.arrays import FloatArray, long_runs
+from diransac.arrays import FloatArray, interpolated, long_runs, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
@@ -86,7 +86,7 @@ class Setup:
         measured = held[rows, : self.n_signals]
         known = np.isfinite(measured)
         missing = np.asarray(np.isnan(held[:, self.n_signals :]).any(axis=1))
-        inputs = _interpolated(held[:, self.n_signals :])
+        inputs = interpolated(held[:, self.n_signals :])
         acting = self.timing.acting(inputs, stream.dt, self.hold)[rows]
         return ShootingIntervals(
             model=self.model,
@@ -104,16 +104,6 @@ class Setup:
             hold=self.hold,
             discrepancies=False,
         )
-
-
-def _interpolated(inputs: FloatArray) -> FloatArray:
-    """Inputs ``(N, n_u)`` with missing samples interpolated, and held at both ends; 0 without any sample."""
-    filled, rows = inputs.copy(), np.arange(len(inputs))
-    for column in filled.T:
-        known = np.isfinite(column)
-        if not known.all():
-            column[:] = np.interp(rows, rows[known], column[known]) if known.any() else 0.0
-    return filled
 
 
 @dataclass(frozen=True)
@@ -261,8 +251,8 @@ def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, moti
     """Fit of the first n intervals of a stream from the parameters of a start."""
     intervals, p = setup.intervals(stream, first, n), given.parameters
     if given.covariance is None:
-        unit = parameter_units(intervals, motion, p)
-        covariance = np.diag(np.square(np.maximum(np.abs(p), np.where(unit > 0.0, unit, 1.0))))
+        units = size_or_one(parameter_units(intervals, motion, p))
+        covariance = np.diag(np.square(np.maximum(np.abs(p), units)))
     else:
         covariance = given.covariance
     std = np.sqrt(np.diag(covariance))

@@ -14,7 +14,7 @@ from diransac.arrays import FloatArray
 from diransac.data import preprocessing
 from diransac.data.dataset import ParameterLayout
 from diransac.data.log import Log
-from diransac.errors import DiransacError, LogError, SettingsError
+from diransac.errors import DiransacError, LogError, SettingsError, check_known
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
@@ -373,8 +373,7 @@ def _check_positive(**values: float) -> None:
 
 def _check_names(argument: str, values: Mapping[str, float], model: Model) -> None:
     for name, value in values.items():
-        if name not in model.parameters:
-            raise SettingsError(f'{argument} names "{name}"; the parameters are {", ".join(model.parameters)}')
+        check_known([name], model.parameters, f"{argument} names", "the parameters are")
         if not (_is_number(value) and np.isfinite(value)):
             raise SettingsError(f'{argument} of "{name}" is {value!r}; give a number in its unit')
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, size_or_one
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
@@ -406,8 +406,7 @@ def _eliminated(H: FloatArray, g: FloatArray, k: int) -> tuple[FloatArray, Float
     n = len(g) - k
     coupling = np.concatenate([H[k : 2 * k, :k], H[:k, 2 * k :].T])
     rest = np.triu(H[k:, k:]) + np.triu(H[k:, k:], 1).T
-    own = np.diag(H)[:k]
-    scale = 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0))
+    scale = 1.0 / np.sqrt(size_or_one(np.diag(H)[:k]))
     # A ridge keeps an unknown which nothing determines.
     scaled = H[:k, :k] * np.outer(scale, scale) + 1e-13 * np.eye(k)
     solved = np.linalg.solve(scaled, scale[:, None] * np.column_stack([coupling.T, g[:k]]))

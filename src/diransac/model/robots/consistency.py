@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, size_or_one
 from diransac.errors import ModelError
 from diransac.model.robots.rigid_body import inertial_parameters, pseudo_inertia
 
@@ -132,7 +132,7 @@ class _Problem:
         self, bodies: FloatArray, constants: FloatArray, B: FloatArray, values: FloatArray, covariance: FloatArray
     ) -> None:
         spread = np.sqrt(np.diag(covariance))
-        scale = np.where(spread > 0.0, spread, 1.0)
+        scale = size_or_one(spread)
         # Added to correlations, which may be singular.
         correlation = covariance / np.outer(scale, scale) + np.diag(np.where(spread > 0.0, 1e-9, 1.0))
         # Least standard error of a combination relative to the sum of its parts' magnitudes in the
