@@ -57,6 +57,8 @@ _TOLD = 0.3
 """Part of the variance of a velocity that samples must take away to tell what the model lacks."""
 _BEGINNING = 8
 """Intervals after the beginning of a log, or a gap, in which what changes a state is the beginning's."""
+_INFLUENCE, _ROUNDS = 5.0, 20
+"""Influence of an interval on all parameters at most, over the mean of all; rounds until the weights are known."""
 _DELAY_STEP = 1e-6
 """Difference of a delay, samples: a wider one meets contacts that begin a step later, which tell nothing of it."""
 
@@ -72,7 +74,7 @@ class Pass:
         diverge, 0 of others.
     scores : (W, n) array
         Contribution of each interval to minus the gradient of the loss with respect to the parameters, the delay of
-        the inputs last if it is estimated; less where all samples of an interval are wrong.
+        the inputs last if it is estimated; with bounded influence, and less where all samples are wrong.
     information : (n, n) array
     states : (W, n_x) array
         At the intervals' starts, after their samples.
@@ -147,6 +149,29 @@ def _inverse(information: FloatArray) -> FloatArray:
     d = np.sqrt(np.maximum(np.diag(information), 0.0))
     scale = np.divide(1.0, d, out=np.zeros_like(d), where=d > TINY)
     return np.asarray(scale[:, None] * np.linalg.pinv(information * np.outer(scale, scale), 1e-10, True) * scale)
+
+
+def bounded_influence(information: FloatArray) -> FloatArray:
+    """Weights ``(W,)`` with which no interval tells more than a few times its share of all parameters.
+
+    Where a contact is about to begin or to slip, slopes hold in a tiny range alone: they are so steep that one interval
+    would outweigh all others.
+
+    Parameters
+    ----------
+    information : (W, n, n) array
+
+    References
+    ----------
+    Krasker, Welsch 1982 (bounded influence).
+    """
+    n, telling = information.shape[1], np.count_nonzero(information.any(axis=(1, 2)))
+    weights, most = np.ones(len(information)), _INFLUENCE * n / max(telling, 1)
+    for _ in range(_ROUNDS):
+        covariance = _inverse(np.einsum("w,wij->ij", weights, information))
+        told = np.einsum("ij,wji->w", covariance, information)
+        weights = np.minimum(1.0, most / np.maximum(told, TINY))
+    return weights
 
 
 @dataclass(frozen=True)
@@ -275,7 +300,7 @@ class _Run:
         self.n = len(p) + predictor.free_delay
         self.states = np.empty((len(one), one.model.n_q + one.model.n_v))
         self.jumps, self.scores = np.zeros_like(self.states), np.zeros((len(one), self.n))
-        self.information, self.losses, self.lost = np.zeros((self.n, self.n)), *np.zeros((2, len(one)))
+        self.information, self.losses, self.lost = np.zeros((len(one), self.n, self.n)), *np.zeros((2, len(one)))
         self.residuals, self.errors, self.expected = np.zeros((3, *one.measured.shape))
         self.surprise, self.age, self.is_lost = list[FloatArray](), 0, False
         self.contradicts = np.zeros(1, bool)
@@ -284,8 +309,11 @@ class _Run:
     def result(self) -> Pass:
         """Sums of all intervals."""
         surprise = float(np.mean(self.surprise)) if self.surprise else 1.0
+        weights = bounded_influence(self.information)
+        scores = weights[:, None] * self.scores
+        information = np.einsum("w,wij->ij", weights, self.information)
         kept = (self.states, self.jumps, self.residuals, surprise, self.errors, self.expected)
-        return Pass(self.losses + self.lost, self.lost, self.scores, self.information, *kept)
+        return Pass(self.losses + self.lost, self.lost, scores, information, *kept)
 
     def batch(self, w: int, state: FloatArray, inputs: FloatArray) -> RolloutBatch:
         """One lane over an interval."""
@@ -380,7 +408,7 @@ class _Run:
         n_q = self.predictor.intervals.model.n_q
         self.age = self.age + 1 if self.predictor.intervals.following[w] and not self.is_lost else 0
         share = update.share(n_samples)
-        self.information += share * update.information
+        self.information[w] = share * update.information
         self.scores[w] = share * update.score
         if self.age < _BEGINNING:
             return
