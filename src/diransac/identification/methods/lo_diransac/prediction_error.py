@@ -126,7 +126,7 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
 
     Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
     standard errors do not see.  The mean of the latest passes counts, or the likeliest of them if their mean loses the
-    motion; it is no surer than a local end nearby, and what it differs from that is an error of either.
+    motion; no parameter is surer than near by the local end, and what it differs from that is an error of either.
 
     Parameters
     ----------
@@ -151,8 +151,8 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
     for k in range(_SPREAD_PASSES):
         precision, pull = _prior(predictor, p)
         step, covariance = now.step(precision, pull, _bounds_of_step(predictor, p)), now.robust_covariance(precision)
-        if (np.abs(_with_delay(predictor, p) - local) <= CLEAR * errors).all():
-            covariance = _no_surer(covariance, errors)
+        is_near = np.abs(_with_delay(predictor, p) - local) <= CLEAR * errors
+        covariance = _no_surer(covariance, np.where(is_near, errors, 0.0))
         if k:  # the first is of the local end
             latest = latest.and_(step, covariance, now.losses)
             passes = [*passes, Minimum(predictor, p, now, False, latest.covariance())][-_LATEST:]
