@@ -542,6 +542,16 @@ def test_results_and_descriptions_are_written_and_read(
     assert set(result.sample(5)) == set(model.parameters)
 
 
+def test_drives_of_the_user_leave_those_of_the_file_as_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "carts.xml"
+    path.write_text(carts(1.5, damping=1.0, drive='position kp="30" dampratio="1"').replace(' name="push0"', ""))
+    for actuation in (None, dr.PositionControl(kp=20.0, kd=0.5)):
+        model = dr.models.mujoco(path, unknown=["body/cart0.mass"], actuation=actuation)
+        text, _ = calibrated_text(path, model, {"body/cart0.mass": 2.0}, np.eye(1))
+        assert '<position kp="30" dampratio="1"' in text
+        assert mujoco.MjModel.from_xml_string(text).body_mass[1] == 2.0
+
+
 def test_an_inertia_that_is_impossible_by_its_errors_is_the_nearest_possible_one(tmp_path: Path) -> None:
     path = tmp_path / "carts.xml"
     path.write_text(carts(1.0, damping=2.0))

@@ -116,9 +116,11 @@ def _takes(document: Document, element: Element, field: str) -> bool:
 
 def _settle_dampings(document: Document, compiled: Any) -> None:
     """Write servos as general actuators if any has a damping ratio, of which MuJoCo makes less with another mass."""
-    for name in {compiled.actuator(k).name for k in range(compiled.nu)} if b"dampratio" in document.source else ():
-        element = document.named("actuator", name, "actuator")
-        if element.tag == "position":
+    if b"dampratio" not in document.source:
+        return
+    names = {compiled.actuator(k).name for k in range(compiled.nu)} - {""}
+    for element in (x for section in document.root.children if section.tag == "actuator" for x in section.children):
+        if element.tag == "position" and element.attributes.get("name") in names:
             _replace_drive(document, compiled, element)
 
 
