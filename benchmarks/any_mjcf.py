@@ -19,7 +19,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco_simulation import Array, columns
+from mujoco_simulation import Array, columns, simulated
 
 import diransac as dr
 
@@ -47,22 +47,15 @@ def chosen(rng: np.random.Generator, machine: mujoco.MjModel) -> Iterator[tuple[
         yield f"actuator/{name}.gainprm[0]", "actuator_gainprm", (machine.actuator(name).id, 0)
 
 
-def moved(rng: np.random.Generator, machine: mujoco.MjModel, rows: int) -> tuple[Array, Array, Array]:
-    """States ``(rows, nq + nv)``, controls ``(rows, nu)`` and sensors of a motion by smoothed noise."""
-    data, share = mujoco.MjData(machine), machine.opt.timestep / SMOOTHING
-    if machine.nkey:
-        mujoco.mj_resetDataKeyframe(machine, data, 0)
+def smoothed_noise(rng: np.random.Generator, machine: mujoco.MjModel, rows: int) -> Array:
+    """Controls ``(rows, nu)`` over the ranges of the drives."""
+    share, drives = machine.opt.timestep / SMOOTHING, np.zeros((rows + 1, machine.nu))
+    for j in range(rows):
+        noise = np.sqrt(2.0 * share) * rng.standard_normal(machine.nu)
+        drives[j + 1] = drives[j] + (noise - share * drives[j])
     limited = machine.actuator_ctrllimited.astype(bool)
     low, high = (np.where(limited, machine.actuator_ctrlrange[:, k], 2.0 * k - 1.0) for k in (0, 1))
-    states, inputs = np.empty((rows, machine.nq + machine.nv)), np.empty((rows, machine.nu))
-    readings, drive = np.empty((rows, machine.nsensordata)), np.zeros(machine.nu)
-    for j in range(rows):
-        drive += -share * drive + np.sqrt(2.0 * share) * rng.standard_normal(machine.nu)
-        inputs[j] = data.ctrl[:] = np.clip(0.5 * (low + high) + 0.45 * (high - low) * drive, low, high)
-        states[j] = np.concatenate([data.qpos, data.qvel])
-        mujoco.mj_step(machine, data)
-        readings[j] = data.sensordata
-    return states, inputs, readings
+    return np.clip(0.5 * (low + high) + 0.45 * (high - low) * drives[1:], low, high)
 
 
 def recorded(rng: np.random.Generator, exact: Mapping[str, Array]) -> dict[str, Array]:
@@ -88,7 +81,8 @@ def measured(path: Path, seed: int, seconds: float) -> dict[str, Any]:
         truth = {mask: float(array[index]) for mask, (array, index) in places.items()}
         mujoco.mj_setConst(machine, mujoco.MjData(machine))
         model, dt = dr.models.mujoco(path, unknown=list(places)), machine.opt.timestep
-        states, inputs, readings = moved(rng, machine, round(seconds / dt))
+        drives = smoothed_noise(rng, machine, round(seconds / dt))
+        states, inputs, readings = simulated(machine, lambda j, _: drives[j], len(drives))
         exact = {n: x for n, x in columns(machine, states, readings).items() if n in model.state}
         log = recorded(rng, exact) | dict(zip(model.inputs, inputs.T, strict=True))
         begin = time.process_time()

@@ -31,7 +31,7 @@ from diransac.identification.methods.lo_diransac.normal_equations import (
     with_residuals,
 )
 from diransac.identification.methods.lo_diransac.projection import projected_candidates, projected_parameters
-from diransac.identification.methods.lo_diransac.refinement import Prior, refine_exact
+from diransac.identification.methods.lo_diransac.refinement import Prior, refine_exact, refine_further
 from diransac.identification.methods.lo_diransac.screening import (
     running_median,
     screened_inputs,
@@ -517,12 +517,12 @@ def test_a_late_recording_of_the_inputs_is_an_unknown_of_the_fit():
     begin = replace(perturbed_fit(intervals, signals), tau=np.full(3, 1e-3))
     unit = np.concatenate([np.full(3, np.inf), np.ones(intervals.n_shared - 3)])
     prior = Prior(tau=np.full(3, 1e-3), unit=unit, discrepancy=1e-3, guarded=1e-3)
-    found = refine_exact(dr.LoDiransac(), early.with_errors([delay]), begin, prior, 1e9)
+    found = refine_exact(dr.LoDiransac(), early.with_errors([delay]), begin, prior)
     assert found.converged
     assert found.intervals.all_errors.sizes[delay] == pytest.approx(2.4, abs=0.05)
     assert found.fit.shared[:3] == pytest.approx(TRUTH, rel=0.02)
-    assert found.cost < refine_exact(dr.LoDiransac(), early, begin, prior, 1e9).cost - 100.0
-    again = refine_exact(dr.LoDiransac(), found.intervals, found.fit, prior)
+    assert found.cost < refine_exact(dr.LoDiransac(), early, begin, prior).cost - 100.0
+    again = refine_further(dr.LoDiransac(), found.intervals, found.fit)
     assert again.steps <= 2  # scales stay as they are
     assert again.cost == pytest.approx(found.cost, abs=1.0)
 

@@ -229,23 +229,5 @@ def student_quantile(degrees_of_freedom: float, probability: float) -> float:
 
 @cache
 def _quadrature() -> tuple[FloatArray, FloatArray]:
-    """Points and weights of Gauss-Legendre quadrature on [-1, 1]; the import of `numpy.polynomial` takes 19 ms."""
-    n = 100
-    k = np.arange(n)
-    scale = 1.0 / np.sqrt(2 * k + 1)
-    beside = k[1:] * scale[:-1] * scale[1:]
-    points = np.asarray(np.linalg.eigvalsh(np.diag(beside, 1) + np.diag(beside, -1)), np.float64)
-
-    def series(*c: float) -> FloatArray:
-        """Sum of Legendre polynomials with these coefficients (Clenshaw)."""
-        before, last = c[-2] + 0.0 * points, c[-1] + 0.0 * points
-        for m in range(len(c) - 1, 1, -1):
-            before, last = c[m - 2] - last * ((m - 1) / m), before + last * points * ((2 * m - 1) / m)
-        return before + last * points
-
-    slopes = series(*np.where(k % 2, 2 * k + 1, 0))
-    points = points - series(*np.zeros(n), 1.0) / slopes  # a step of Newton's method
-    lower = series(*np.zeros(n - 1), 1.0)
-    weights = 1.0 / (lower / np.abs(lower).max() * (slopes / np.abs(slopes).max()))
-    points, weights = 0.5 * (points - points[::-1]), 0.5 * (weights + weights[::-1])
-    return points, weights * (2.0 / weights.sum())
+    """Points and weights of Gauss-Legendre quadrature on [-1, 1]."""
+    return np.polynomial.legendre.leggauss(100)

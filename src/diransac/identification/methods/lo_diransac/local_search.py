@@ -33,7 +33,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     errors_of_signals,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, start
+from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, refine_further, start
 from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG
 from diransac.simulation import HOLDS
 
@@ -330,9 +330,10 @@ class LocalSearch:
         if not now.exact:
             return replace(now, refinement=refine(self.settings, intervals, begin, self.prior))
         kept = set(intervals.all_errors.kinds) >= set(now.intervals.all_errors.kinds)
+        if kept and intervals.hold == now.intervals.hold:
+            return replace(now, refinement=refine_further(self.settings, intervals, begin))
         # Inputs that act otherwise move the motion by far more than its scales.
-        rival = None if kept and intervals.hold == now.intervals.hold else now.cost
-        return replace(now, refinement=refine_exact(self.settings, intervals, begin, self.prior, rival))
+        return replace(now, refinement=refine_exact(self.settings, intervals, begin, self.prior, now.cost))
 
     def _better(
         self,

@@ -24,6 +24,7 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
+from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
 from diransac.identification.methods.lo_diransac.parts import compared_parts
@@ -185,8 +186,6 @@ class LoDiransac(LoDiransacSettings):
         TimeLimitError
             The time limit was reached.
         """
-        from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
-
         nothing: Searched | None = None
         best = dataset.kept(_key(self, seed), lambda: nothing)
         if best is None:  # the model has no equations

@@ -126,7 +126,7 @@ def over_spread(found: Minimum, *, outliers: bool, progress: Callable[[int, Mini
 
     Where contacts chatter, a fit with local slopes ends in one of many small valleys of its loss, which slopes over ten
     standard errors do not see.  The mean of the latest passes counts, or the likeliest of them if their mean loses the
-    motion; no parameter is surer than near by the local end, and what it differs from that is an error of either.
+    motion.  A parameter near its local end is no surer than there; the difference is an error of either.
 
     Parameters
     ----------

@@ -287,7 +287,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
 
 
 def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float | None = None
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float = np.inf
 ) -> Refinement:
     """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
 
@@ -300,7 +300,6 @@ def refine_exact(
     prior : Prior
     rival : float, optional
         Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
-        None: the initial fit is exact, and its scales stay as tight as they are.
 
     Returns
     -------
@@ -311,13 +310,40 @@ def refine_exact(
     TimeLimitError
         The time limit was reached.
     """
-    n_p, least, jumps = intervals.n_p, fit.tau, fit.continuity_std
-    if rival is not None:
-        shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
-        shared[n_p:], sizes[n_p:] = 0.0, _EXACT * prior.guarded * prior.unit[n_p:]
-        least, jumps = _EXACT * prior.tau, negligible_jumps(intervals, tau)
-        fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
-        fit = with_residuals(intervals, replace(fit, continuity_std=jumps))
+    shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
+    shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _EXACT * prior.guarded * prior.unit[intervals.n_p :]
+    fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
+    fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
+    return _tightened(settings, intervals, fit, _EXACT * prior.tau, rival)
+
+
+def refine_further(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit) -> Refinement:
+    """Fit of the model as it is from another one, whose scales stay as tight as they are.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    intervals : ShootingIntervals
+    fit : Fit
+        As from `refine_exact`.
+
+    Returns
+    -------
+    Refinement
+
+    Raises
+    ------
+    TimeLimitError
+        The time limit was reached.
+    """
+    return _tightened(settings, intervals, fit, fit.tau, np.inf)
+
+
+def _tightened(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, least: FloatArray, rival: float
+) -> Refinement:
+    """Fit whose unmodelled accelerations and jumps are tightened step by step, down to some least accelerations."""
+    n_p, jumps, begins = intervals.n_p, fit.continuity_std, bool((fit.tau > least).any())
     damping, converged, steps, at, behind = 0.0, False, 0, linearized(intervals, fit), list[float]()
     del fit
     while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
@@ -325,11 +351,11 @@ def refine_exact(
         steps += 1
         taken = gauss_newton_step(at, damping)
         intervals, moved, damping = taken.intervals, taken.fit, taken.damping
-        if rival is not None:
+        if rival < np.inf:
             behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
         noise = moved.noise.updated(moved.residuals, intervals.known, outliers=settings.outliers)
         tau = np.maximum(least, _TIGHTENED * at.fit.tau)
-        if rival is not None and steps == 1:
+        if begins and steps == 1:
             jumps = np.clip(unbroken_jumps(at.fit, taken.solved), negligible_jumps(intervals, least), jumps)
         continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
         updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
