@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, row_blocks
 from diransac.errors import SettingsError
 
 REACH = 2.5
@@ -148,7 +148,6 @@ def median_filter(values: Any, size: int) -> Any:
     """
     reach = size // 2
     windows, medians = mirrored_windows(values, reach), np.empty_like(values)
-    for first in range(0, len(values), _ROWS_AT_A_TIME):
-        some = slice(first, first + _ROWS_AT_A_TIME)
+    for some in row_blocks(len(values), _ROWS_AT_A_TIME):
         medians[some] = np.partition(windows[some], reach)[..., reach]
     return medians

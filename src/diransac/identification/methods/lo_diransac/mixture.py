@@ -7,7 +7,7 @@ Torr and Zisserman 2000, "MLESAC"; Dempster, Laird, Rubin 1977 (EM).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -22,7 +22,7 @@ _BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
 _FEWEST = 5
 _SHRINK = 0.4
 _FRACTION = (0.002, 0.95)
-# Rows of which densities are computed at a time.
+# Rows of which densities are computed at a time: they stay in the cache.
 _ROWS_AT_A_TIME = 4096
 # Sigmas from which on exp(-x^2 / 2) is 0 in double precision.
 _FAR = 40.0
@@ -103,7 +103,7 @@ class Mixture:
     def inlying(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
         found = np.empty(residuals.shape)
-        for rows in _parts(len(residuals)):
+        for rows in row_blocks(len(residuals), _ROWS_AT_A_TIME):
             self._inlying(residuals[rows], known[rows], found[rows])
         return found
 
@@ -123,7 +123,7 @@ class Mixture:
     def negative_log_likelihood(self, residuals: FloatArray, known: BoolArray) -> FloatArray:
         """Negative log-likelihood ``(N, n_s)`` of each sample; 0 where it is missing."""
         found = np.empty(residuals.shape)
-        for rows in _parts(len(residuals)):
+        for rows in row_blocks(len(residuals), _ROWS_AT_A_TIME):
             self._loss(residuals[rows], known[rows], found[rows])
         return found
 
@@ -198,11 +198,6 @@ class Mixture:
         seen = sums.count >= _FEWEST
         pi = np.where(seen & outliers, pi, self.pi)
         return replace(self, sigma=np.where(seen, sigma, self.sigma), pi=pi)
-
-
-def _parts(n: int) -> Iterator[slice]:
-    """Rows in parts that stay in the cache."""
-    return (slice(k, k + _ROWS_AT_A_TIME) for k in range(0, n, _ROWS_AT_A_TIME))
 
 
 def lower_scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
