@@ -194,25 +194,39 @@ def test_ctrl_c_ends_a_loop_between_two_blocks(threads: int):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("n_blocks", [1, 7, 100])
-def test_every_block_runs_once(threads: int, n_blocks: int):
-    done = np.zeros(n_blocks, int)
+@pytest.mark.parametrize("n_blocks", [0, 1, 7, 100])
+@pytest.mark.parametrize("pause", [0.0, 2e-3])  # s; threads share long loops
+def test_every_block_runs_once(threads: int, n_blocks: int, pause: float):
+    done, seen = np.zeros(n_blocks, int), set[int]()
 
     def loop(first: int, end: int) -> None:
+        if pause:
+            time.sleep(pause)
         done[first:end] += 1
+        seen.add(threading.get_ident())
 
     run_blocks(loop, [], n_blocks, threads)
     np.testing.assert_array_equal(done, 1)
+    if pause == 0.0 or threads == 1:
+        assert seen == {threading.get_ident()}
+    elif n_blocks == 100:
+        assert len(seen) > 1
 
 
-def test_an_error_in_a_loop_is_raised():
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("in_another", [False, True])
+def test_an_error_in_a_loop_is_raised(threads: int, in_another: bool):
     def broken(first: int, end: int) -> None:
-        raise ZeroDivisionError("planted")
+        time.sleep(2e-3)
+        if in_another == (threading.current_thread() is not threading.main_thread()):
+            raise ZeroDivisionError("planted")
 
     call: Callable[..., None] = broken
-    for threads in (1, 2):
+    if in_another and threads == 1:
+        run_blocks(call, [], 100, threads)
+    else:
         with pytest.raises(ZeroDivisionError, match="planted"):
-            run_blocks(call, [], 20, threads)
+            run_blocks(call, [], 100, threads)
 
 
 def test_a_search_for_mistakes_that_time_ended_is_made_again():

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import os
 import time
+from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from itertools import pairwise
@@ -26,6 +28,9 @@ LANES = 8
 
 _PATIENCE = 0.2
 """Longest time, s, for which signals are not noticed, where the work can be interrupted."""
+
+_WORTH_THREADS = 3e-4
+"""Time, s, that a loop takes at least if it is shared among threads."""
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
@@ -234,22 +239,34 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
     """
     if threads < 1:
         raise SettingsError(f"threads is {threads}, but at least 1 has to run.")
-    loop = partial(call, *arguments)
-    if threads == 1 or n_blocks == 1:
-        _run_some(loop, 0, n_blocks, Event())
+    loop, stopped = partial(call, *arguments), Event()
+    # The first blocks tell how long the others take: handing these out to threads takes longer than a short loop.
+    begin, timed = time.monotonic(), min(n_blocks, 8, max(1, n_blocks // 16))
+    loop(0, timed)
+    left = (time.monotonic() - begin) * (n_blocks - timed) / max(timed, 1)
+    if threads == 1 or left < _WORTH_THREADS:
+        _run_some(loop, timed, n_blocks, stopped)
         return
-    from concurrent.futures import Future, wait
+    from concurrent.futures import wait
 
-    edges = np.linspace(0, n_blocks, min(n_blocks, threads * 4) + 1).astype(int).tolist()
-    pool, stopped, parts = _pool(os.getpid(), threads), Event(), list[Future[None]]()
+    parts = deque(pairwise(np.linspace(timed, n_blocks, min(n_blocks - timed, threads * 4) + 1).astype(int).tolist()))
+    work = partial(_run_parts, loop, parts, stopped)
+    others = [_pool(os.getpid(), threads - 1).submit(work) for _ in range(min(threads, len(parts)) - 1)]
     try:
-        for first, end in pairwise(edges):
-            parts.append(pool.submit(_run_some, loop, first, end, stopped))
-        for part in parts:
-            part.result()
+        work()
+        for other in others:
+            if not other.cancel():  # it has begun
+                other.result()
     finally:  # the loop's arrays live as long as this call
         stopped.set()
-        wait([part for part in parts if not part.cancel()])
+        wait([other for other in others if not other.cancel()])
+
+
+def _run_parts(loop: Callable[[int, int], None], parts: deque[tuple[int, int]], stopped: Event) -> None:
+    """Take parts of a loop and run them until none is left."""
+    with suppress(IndexError):
+        while True:
+            _run_some(loop, *parts.popleft(), stopped)
 
 
 def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event) -> None:
