@@ -405,22 +405,31 @@ def test_a_sensor_that_the_log_lacks_is_refused_by_name():
         estimate(pendulum_log(), gain_drifts=("angle",))
 
 
-def test_a_search_ends_where_another_began_as_likely_or_is_ahead_before_errors_of_recordings():
+def test_a_search_ends_where_the_freedom_of_another_makes_it_no_likelier_or_leads_to_the_same_parameters():
     log = pendulum_log()
-    late = {"angle_ddot": np.r_[np.full(3, np.nan), log["angle_ddot"][:-3]]}
-    signals = {name: log[name] for name in ("angle", "angle_dot", "torque")} | late
-    dataset, settings = Dataset.of(MODEL, dr.Log.from_arrays(log.time, signals), pointwise=False), dr.LoDiransac()
+    unmodelled = log["torque"] + 0.1 * np.sin(2.0 * log.time)
+    late = {"angle_ddot": np.r_[np.full(3, np.nan), log["angle_ddot"][:-3]], "torque": unmodelled}
+    signals = {name: log[name] for name in ("angle", "angle_dot")} | late
+    dataset = Dataset.of(MODEL, dr.Log.from_arrays(log.time, signals), pointwise=False)
+    settings = dr.LoDiransac(sensor_delays="angle_ddot")
     whole = prepared(settings, dataset)
     found = searched(settings, *whole, 0, dataset, None).likeliest
+    assert not found.exact
     assert [x.what for x in found.intervals.all_errors.kinds] == ["delay"]
-    assert found.cost < found.cost_before_errors - 100.0
 
-    def beside(ahead):
-        rival = replace(found, first_cost=np.inf, cost_before_errors=found.cost_before_errors - ahead)
-        return searched(settings, *whole, 0, dataset, None, rival=rival).likeliest
+    def beside(behind=100.0, moved=0.0, **changes):
+        """Outcome beside a search with that fit, but for its cost and its parameters, and its explanation."""
+        fit = found.refinement.fit
+        other = replace(fit, shared=fit.shared * (1.0 + moved))
+        rival = replace(found, refinement=replace(found.refinement, fit=other, cost=found.cost + behind), **changes)
+        return searched(settings, *whole, 0, dataset, None, rival=rival).likeliest, rival
 
-    assert beside(4.0).cost == found.cost
-    behind = beside(6.0)
-    assert behind.cost == found.cost_before_errors
-    assert not behind.intervals.all_errors.kinds
-    assert searched(settings, *whole, 0, dataset, None, rival=found).likeliest is found
+    ended, rival = beside(behind=-100.0)
+    assert ended is rival
+    ended, _ = beside()  # the fit with the rival's freedom is likelier, and its parameters are the rival's
+    assert ended.cost == pytest.approx(found.cost, abs=40.0)
+    assert ended.cost != found.cost
+    assert ended.intervals.all_errors.kinds == found.intervals.all_errors.kinds
+    for ended, _ in (beside(moved=0.5), beside(exact=True)):  # the search goes on
+        assert ended.cost == found.cost
+        assert not ended.exact

@@ -26,7 +26,7 @@ from diransac.identification.methods.lo_diransac.integration_steps import answer
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
-from diransac.identification.methods.lo_diransac.projection import projected_parameters
+from diransac.identification.methods.lo_diransac.projection import fitted_parameters, projected_parameters
 from diransac.identification.methods.lo_diransac.recording_errors import (
     clear_errors,
     errors_of_inputs,
@@ -71,16 +71,11 @@ class Explanation:
         Whether the fit is one of the model as it is.
     complete : bool, optional
         False if the time limit ended the search for a likelier one.
-    first_cost, cost_before_errors : float, optional
-        Costs of the first fit of its search, and of the likeliest explanation, with errors of the recordings that
-        settings name, before others were sought.
     """
 
     refinement: Refinement
     exact: bool
     complete: bool = True
-    first_cost: float = np.inf
-    cost_before_errors: float = np.inf
 
     @property
     def intervals(self) -> ShootingIntervals:
@@ -139,9 +134,8 @@ class LocalSearch:
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
         rival : Explanation, optional
-            Outcome of another search.  It is taken for that of this one, too, where the first fits of both are as
-            likely.  Where it was likelier before errors of the recordings were sought, this search
-            ends there.
+            Outcome of another search.  A fit with its freedom decides whether this search is needed: it ends there
+            unless it is likelier and has other parameters.
 
         Returns
         -------
@@ -171,22 +165,35 @@ class LocalSearch:
     ) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
-        flexible = replace(flexible, first_cost=flexible.cost)
         yield self._shown(flexible, 0.35)
-        if rival is not None and abs(flexible.cost - rival.first_cost) < AS_LIKELY:
-            yield rival
+        if rival is not None and (ended := self._ended_by(rival, flexible)) is not None:
+            yield ended
             return
         best = self._accurate(self._simplest(flexible))
         yield self._shown(best, 0.6)
         named = self._named(intervals)
         if named:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
-        best = replace(best, cost_before_errors=best.cost)
-        yield best
-        if rival is not None and best.cost > rival.cost_before_errors + AS_LIKELY:
-            return
+            yield best
         for k, found in enumerate(self._with_more_errors(best, free_hold=free_hold)):
             yield self._shown(found, 0.6 + 0.03 * k)
+
+    def _ended_by(self, rival: Explanation, flexible: Explanation) -> Explanation | None:
+        """The likelier of a rival and a fit with its freedom; None where the fit is likelier, with other parameters.
+
+        None, too, where the rival is exact, or its intervals are no parts of these.
+        """
+        parts, rest = divmod(flexible.intervals.length, rival.intervals.length)
+        if rival.exact or rest:
+            return None
+        intervals, own = replace(rival.intervals, hold=flexible.intervals.hold), rival.refinement.fit
+        _, begin = split(flexible.intervals, flexible.refinement.fit, parts)
+        found = self._optimised(rival, intervals, with_residuals(intervals, begin))
+        if found.cost > rival.cost - AS_LIKELY:
+            return rival
+        n, estimate = intervals.n_p, fitted_parameters(rival.intervals, own)
+        errors, moved = np.sqrt(np.diag(estimate.covariance)), found.refinement.fit.shared[:n] - own.shared[:n]
+        return found if (np.abs(moved) < errors).all() else None
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""

@@ -240,7 +240,7 @@ def searched(
     hypotheses: FloatArray | None = None,
     rival: Explanation | None = None,
 ) -> Searched:
-    """A search that begins with a motion, and with hypotheses or samples; a rival ends it early, as in `likeliest`."""
+    """A search that begins with a motion, and with hypotheses or samples; a rival may end it early."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
     n_spikes = 0
