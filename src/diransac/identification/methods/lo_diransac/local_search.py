@@ -135,7 +135,7 @@ class LocalSearch:
             Whether another hold of the inputs may be an explanation.
         rival : Explanation, optional
             Outcome of another search.  A fit with its freedom decides whether this search is needed: it ends there
-            unless it is likelier and has other parameters.
+            if it is less likely, or leads to the same parameters.
 
         Returns
         -------
@@ -179,21 +179,22 @@ class LocalSearch:
             yield self._shown(found, 0.6 + 0.03 * k)
 
     def _ended_by(self, rival: Explanation, flexible: Explanation) -> Explanation | None:
-        """The likelier of a rival and a fit with its freedom; None where the fit is likelier, with other parameters.
+        """What ends a search beside a rival; None where it may find another explanation as likely.
 
-        None, too, where the rival is exact, or its intervals are no parts of these.
+        A fit with the rival's freedom, where this is not exact and its intervals are parts of these, tells: the rival
+        stays where that is less likely, and the likelier of both where their parameters agree.
         """
         parts, rest = divmod(flexible.intervals.length, rival.intervals.length)
-        if rival.exact or rest:
+        if rival.exact or rest or flexible.cost < rival.cost:
             return None
         intervals, own = replace(rival.intervals, hold=flexible.intervals.hold), rival.refinement.fit
         _, begin = split(flexible.intervals, flexible.refinement.fit, parts)
         found = self._optimised(rival, intervals, with_residuals(intervals, begin))
-        if found.cost > rival.cost - AS_LIKELY:
+        if found.cost > rival.cost + AS_LIKELY:
             return rival
         n, estimate = intervals.n_p, fitted_parameters(rival.intervals, own)
         errors, moved = np.sqrt(np.diag(estimate.covariance)), found.refinement.fit.shared[:n] - own.shared[:n]
-        return found if (np.abs(moved) < errors).all() else None
+        return min(rival, found, key=lambda x: x.cost) if (np.abs(moved) < errors).all() else None
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""
