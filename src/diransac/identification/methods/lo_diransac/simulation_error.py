@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,6 +50,8 @@ _WHOLE_ROW = 1.0 / 12.0
 _STEPS, _FEW_STEPS, _CONVERGED, _NOISE_MOVES = 25, 3, 0.1, 0.03
 """Steps at most, and of a solution that is close to another; change of parameters, standard errors, and relative change
 of the noise that end them."""
+_HOPELESS = 0.1
+"""Loss of log-likelihood per sample, of errors a tenth larger, from which on a solution is not followed to its end."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
 _RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
@@ -90,11 +92,11 @@ def simulation_error_candidates(
     first = _from_starts(intervals, motion, starts, actings[0], lengths[0], outliers=outliers)
     if first is None:
         return []
-    chain = [min([first, *(first.with_inputs(x) for x in actings[1:])], key=lambda x: x.cost)]
+    chain = [reduce(_Solution.likelier, (first.with_inputs(x) for x in actings[1:]), first)]
     for length in lengths:
         chain.append(chain[-1].grown(length).descended())
     last, taken = chain[-1], chain[-1].segments.acting
-    others = [last.with_inputs(x) for x in actings if x is not taken]
+    others = [last.with_inputs(x).descended(rival=last.cost) for x in actings if x is not taken]
     return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
 
 
@@ -177,8 +179,8 @@ def _from_starts(
         return None
     noise = _first_noise(some, motion.spread, outliers=outliers)
     order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
-    found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
-    return min(found, key=lambda x: x.cost)
+    first, *others = (_Solution.begin(some, motion, starts[k], noise) for k in order)
+    return reduce(_Solution.likelier, others, first.descended())
 
 
 def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
@@ -306,11 +308,20 @@ class _Solution:
         following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
         return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
-    def descended(self, steps: int = _STEPS) -> _Solution:
-        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
-        now, damping = self, _DAMPING
-        for _ in range(steps):
+    def likelier(self, other: _Solution) -> _Solution:
+        """The likelier of this solution and another one, which descends as long as it may become so."""
+        found = other.descended(rival=self.cost)
+        return found if found.cost < self.cost else self
+
+    def descended(self, steps: int = _STEPS, rival: float = np.inf) -> _Solution:
+        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM).
+
+        They end where as much gain in all others would leave the samples clearly less likely than a rival does.
+        """
+        now, damping, hopeless = self, _DAMPING, rival + _HOPELESS * np.count_nonzero(self._known)
+        for left in reversed(range(steps)):
             check_time()
+            cost = now.cost
             sums = NoiseSums.of(now.errors, now._known, now._losses_and_inlying[1])
             noise = now.noise.of_sums(sums, outliers=bool(now.noise.pi.any()))
             is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
@@ -319,7 +330,7 @@ class _Solution:
             if then is None:
                 break
             now = then
-            if change < _CONVERGED and is_steady:
+            if (change < _CONVERGED and is_steady) or now.cost - left * (cost - now.cost) > hopeless:
                 break
         return now
 
@@ -345,9 +356,9 @@ class _Solution:
         scale = np.nan_to_num(lower_scale(found.errors, found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
 
-    def with_inputs(self, acting: ActingInputs, steps: int = _STEPS) -> _Solution:
-        """The solution with inputs that act otherwise, after some steps from this one."""
-        return self._at(replace(self.segments, acting=acting), self.parameters, self.states).descended(steps)
+    def with_inputs(self, acting: ActingInputs) -> _Solution:
+        """The solution with inputs that act otherwise, at the same parameters and states."""
+        return self._at(replace(self.segments, acting=acting), self.parameters, self.states)
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
@@ -377,7 +388,7 @@ class _Solution:
         while step:
             for x in (at - step, at + step):
                 if x not in tried and abs(x) < one.n_rows:
-                    tried[x] = self.with_inputs(one.acting.shifted(one.intervals, x), _FEW_STEPS)
+                    tried[x] = self.with_inputs(one.acting.shifted(one.intervals, x)).descended(_FEW_STEPS)
             best = min(tried, key=lambda x: tried[x].cost)
             at, step = best, (2 * step if best != at else step // 2)
         if not {at - 1, at + 1} <= tried.keys():
@@ -409,7 +420,8 @@ def _lanes(segments: Segments, parameters: FloatArray, states: FloatArray) -> tu
 
 def _errors(segments: Segments, parameters: FloatArray, states: FloatArray) -> FloatArray:
     """Simulated less measured samples ``(K n_rows, n_s)``; arguments as of `_lanes`."""
-    return segments.errors(*_lanes(segments, parameters, states))[0].reshape(-1, len(segments.columns))
+    errors = segments.errors(*_lanes(segments, parameters, states))[0]
+    return np.asarray(errors.reshape(-1, len(segments.columns)))
 
 
 def _with_priors(intervals: ShootingIntervals, p: FloatArray, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
