@@ -270,7 +270,7 @@ def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> No
     assert Comparison.of(found).as_good.tolist() == [True, False, False]
     assert fair.lost is not None
     rows = judge.segments.rows[:, judge.n_before :]
-    lost = fair.lost[:, :, 0]
+    lost = fair.lost[0]
     assert lost[burst[rows]].mean() > 0.9
     assert lost[~burst[rows]].mean() < 0.2
 

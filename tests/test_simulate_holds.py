@@ -144,6 +144,8 @@ def test_smooth_inputs_of_a_log_do_not_depend_on_those_of_its_neighbours():
         among = RolloutBatch(p, first.states, together, 0.01, **lane, first_rows=np.array([0, 20]))
         alone = RolloutBatch(p, first.states, together[rows], 0.01)
         np.testing.assert_array_equal(engine.trajectories(among), engine.trajectories(alone))
+        outside = RolloutBatch(p, first.states, together[rows], 0.01, first_rows=np.array([-7, 0, 90]))
+        np.testing.assert_array_equal(engine.trajectories(outside), engine.trajectories(alone))
 
 
 @pytest.mark.parametrize("substeps", [1, 3])

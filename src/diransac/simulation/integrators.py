@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
@@ -59,7 +59,7 @@ def input_columns(hold: str, inputs: FloatArray, substeps: int, first_rows: IntA
     inputs : (n_log, n_u) array
     substeps : int
     first_rows : (n,) int array
-        First row of each log.
+        First row of each log; of logs that begin or end elsewhere, outside of these rows.
 
     Returns
     -------
@@ -68,15 +68,19 @@ def input_columns(hold: str, inputs: FloatArray, substeps: int, first_rows: IntA
     """
     if hold == "zero-order":
         return inputs
-    first, second = np.diff(inputs, axis=0, append=inputs[-1:]) / substeps, np.zeros_like(inputs)
+    columns = np.zeros((len(inputs), 3, inputs.shape[1]))
+    first, second = columns[:, 1], columns[:, 2]
+    columns[:, 0], first[:-1] = inputs, (inputs[1:] - inputs[:-1]) / substeps
     if hold == "smooth":
-        for log in np.split(np.arange(len(inputs)), first_rows[first_rows > 0]):
-            if len(log) > 2:
-                bends = np.pad(np.diff(inputs[log], 2, axis=0), ((1, 1), (0, 0)), mode="edge")
-                second[log[:-1]] = 0.5 * (bends[:-1] + bends[1:])
+        within = first_rows[(first_rows > 0) & (first_rows < len(inputs))]
+        for start, end in pairwise([0, *within.tolist(), len(inputs)]):
+            if end - start > 2:
+                bends = np.diff(inputs[start:end], 2, axis=0)
+                second[start], second[end - 2] = bends[0], bends[-1]
+                second[start + 1 : end - 2] = 0.5 * (bends[:-1] + bends[1:])
         first -= (substeps - 1) / (2 * substeps**2) * second
         second /= substeps**2
-    return np.hstack([inputs, first, second])
+    return columns.reshape(len(inputs), -1)
 
 
 def interpolated(u: Any, first: Any, second: Any, fraction: Any) -> Any:

@@ -134,6 +134,8 @@ class MujocoRollouts(Simulator):
                 if normal_matrix:
                     matrix[part] = flat.swapaxes(1, 2) @ (w.reshape(len(errors), -1, 1) * flat)
         diverged = ~(np.isfinite(cost) & np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1))
+        if normal_matrix:
+            diverged |= ~np.isfinite(matrix).all(axis=(1, 2))
         cost[diverged], gradient[diverged], slopes[diverged], final[diverged] = np.inf, 0.0, np.nan, np.nan
         along[diverged] = 0.0
         if normal_matrix:

@@ -228,14 +228,20 @@ def mixture_intervals(
 
 
 def _quantiles(weights: FloatArray, means: FloatArray, deviations: FloatArray, level: float) -> FloatArray:
-    """Quantile ``(n,)`` of each mixture (K, n), by bisection."""
+    """Quantile ``(n,)`` of each mixture (K, n), by Newton's method; by bisection where it leaves the bounds."""
     # Beyond nine standard deviations a normal distribution has nothing, to rounding errors.
     low, high = (means - 9.0 * deviations).min(axis=0), (means + 9.0 * deviations).max(axis=0)
+    found = 0.5 * (low + high)
     for _ in range(60):
-        middle = 0.5 * (low + high)
-        below = weights @ _normal((middle - means) / deviations) < level
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.asarray(0.5 * (low + high))
+        z, before = (found - means) / deviations, found
+        excess = weights @ _normal(z) - level
+        low, high = np.where(excess < 0.0, found, low), np.where(excess < 0.0, high, found)
+        density = weights @ (np.exp(-0.5 * np.square(z)) / deviations) / math.sqrt(2.0 * math.pi)
+        found = found - excess / np.maximum(density, 1e-300)
+        found = np.where((low <= found) & (found <= high), found, 0.5 * (low + high))
+        if (np.abs(found - before) <= 1e-12 * deviations.min(axis=0)).all():
+            break
+    return np.asarray(found)
 
 
 def _normal(x: FloatArray) -> FloatArray:

@@ -53,6 +53,7 @@ ARGUMENTS = {
     "end_block": "integer",
 }
 """Arguments of the compiled time loop, in order, and their kinds."""
+_BEFORE_BLOCKS = [name for name in ARGUMENTS if not name.endswith("_block")]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -253,7 +254,7 @@ def time_loop_arguments(lanes: Lanes, given: Mapping[str, Any]) -> list[Any]:
     """Arguments of the compiled time loop, all but the blocks; arrays as addresses, which do not keep them alive."""
     sizes = {"n_lanes": lanes.n_lanes, "n_padded": lanes.n_padded, "n_rows": lanes.n_rows}
     known = {**lanes.arrays, **given, **sizes}
-    values = [known.get(name, 0) for name in ARGUMENTS if not name.endswith("_block")]
+    values = [known.get(name, 0) for name in _BEFORE_BLOCKS]
     return [value.ctypes.data if isinstance(value, np.ndarray) else value for value in values]
 
 

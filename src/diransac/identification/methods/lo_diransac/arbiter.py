@@ -12,14 +12,15 @@ Shao 1993 (choice by cross-validation); Burman, Chow, Nolan 1994 (blocks of depe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.segments import OUTLYING, Segments, prior_states, stretches
 from diransac.identification.regression.uncertainty import student_quantile
@@ -171,8 +172,8 @@ class Arbiter:
         Samples that a fit takes for no outliers; they count before a prediction.
     noise : (n_signals,) array
         Standard deviation of each signal, by which samples before a prediction are weighted.
-    lost : (K, n_after, n_s) bool array, optional
-        Predicted samples that do not count; None before candidates are compared.
+    lost : (n_s, K, n_after) bool array, optional
+        Samples of the predicted signals that do not count; None before candidates are compared.
     """
 
     segments: Segments
@@ -227,36 +228,53 @@ class Arbiter:
         return [-(-n // self._after.step) for n in self.steps]
 
     @cached_property
+    def _places(self) -> IntArray:
+        """Places ``(n_s,)`` of the predicted signals among those that are compared: states and sensors, if any."""
+        model, columns = self.segments.intervals.model, self.segments.columns
+        names = [model.signals[k] for k in columns]
+        found = np.flatnonzero([n in model.state or n in model.sensors for n in names])
+        return found if len(found) else np.arange(len(columns))
+
+    def _predicted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values ``(n_s, K, n_after)`` of the predicted samples, from those of all samples ``(N, n_signals)``."""
+        return values.T[self.segments.columns[self._places]][:, self.segments.rows[:, self._after]]
+
+    @cached_property
     def _known(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the predicted samples that count."""
-        one = self.segments
-        sampled = one.intervals.sampled[one.rows[:, self._after]][:, :, one.columns] & _predicted(one)
-        return np.asarray(sampled if self.lost is None else sampled & ~self.lost)
+        """Mask ``(n_s, K, n_after)`` of the predicted samples that count."""
+        sampled = self._predicted(self.segments.intervals.sampled)
+        return sampled if self.lost is None else sampled & ~self.lost
 
     @cached_property
     def _counts(self) -> list[IntArray]:
-        """Numbers ``(K, n_s)`` of the predicted samples that count, by horizon."""
-        return [self._known[:, :n].sum(axis=1) for n in self._n_rows]
+        """Numbers ``(n_s, K)`` of the predicted samples that count, by horizon."""
+        return [np.count_nonzero(self._known[:, :, :n], axis=2) for n in self._n_rows]
 
     @cached_property
     def outliers_of_fit(self) -> BoolArray:
-        """Mask ``(K, n_after, n_s)`` of the predicted samples that a fit takes for outliers."""
-        return ~self.inlying[self.segments.rows[:, self._after]][:, :, self.segments.columns]
+        """Mask ``(n_s, K, n_after)`` of the predicted samples that a fit takes for outliers."""
+        return ~self._predicted(self.inlying)
 
     @cached_property
-    def _sizes(self) -> tuple[FloatArray, list[FloatArray]]:
-        """Spread ``(n_s,)`` of what counts, and RMS errors of the prediction that nothing changes, by horizon."""
-        one, few = self.segments, max(1, min(3, self.n_before))
-        before, after = one.rows[:, self.n_before - few : self.n_before], one.rows[:, self._after]
+    def _measured(self) -> FloatArray:
+        """Predicted samples ``(n_s, K, n_after)``; NaN where they do not count."""
+        return np.where(self._known, self._predicted(self.segments.intervals.measured), np.nan)
+
+    @cached_property
+    def _spread(self) -> FloatArray:
+        """Spread ``(n_s,)`` of what counts."""
+        flat = self._measured.reshape(len(self._measured), -1)
+        return size_or_one(_root_mean_squares(flat - _medians(flat)[:, None]))
+
+    @cached_property
+    def _no_change(self) -> list[FloatArray]:
+        """RMS errors ``(n_s,)`` of the prediction that nothing changes, by horizon."""
+        one, few, y = self.segments, max(1, min(3, self.n_before)), self._measured
+        before, columns = one.rows[:, self.n_before - few : self.n_before], one.columns[self._places]
         measured, seen = one.intervals.measured, one.intervals.sampled & self.inlying
-        last = np.where(seen, measured, np.nan)[before][:, :, one.columns]
-        y = np.where(self._known, measured[after][:, :, one.columns], np.nan)
-        flat = y.reshape(-1, y.shape[2])
-        spread = _root_mean_squares(flat - _medians(flat))
-        spread = np.where(spread > 0.0, spread, 1.0)
-        apart = y - _medians(last)[:, None]
-        sizes = [_root_mean_squares(apart[:, :n].reshape(-1, y.shape[2])) for n in self._n_rows]
-        return spread, [np.where(size > 0.0, size, spread) for size in sizes]
+        apart = y - _medians(np.where(seen, measured, np.nan).T[columns][:, before])[:, :, None]
+        sizes = [_root_mean_squares(apart[:, :, :n].reshape(len(y), -1)) for n in self._n_rows]
+        return [np.where(size > 0.0, size, self._spread) for size in sizes]
 
     def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
         """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
@@ -273,15 +291,15 @@ class Arbiter:
         -------
         Arbiter, list of Scores
         """
-        errors = [self._errors(x) for x in candidates]
+        errors = self._errors(candidates)
         scales = np.array([self._block_scales(x) for x in errors])
         nearest = np.full(self._known.shape, np.inf)
         for good, e in zip(scales <= _GOOD * np.fmin.reduce(scales), errors, strict=True):
-            own = good[self.block]
-            nearest[own] = np.minimum(nearest[own], np.abs(e[own]))
-        far = self._known & (nearest > OUTLYING * np.nan_to_num(_scale(nearest, self._known), nan=np.inf))
+            np.minimum(nearest, np.abs(e), out=nearest, where=good[self.block][:, None])
+        scale = np.nan_to_num(_scale(nearest, self._known), nan=np.inf)
+        far = self._known & (nearest > OUTLYING * scale[:, None, None])
         fair, n_lost = self, 0
-        while (lost := far & (self.outliers_of_fit | (nearest > fair._sizes[0]))).sum() > n_lost:
+        while (lost := far & (self.outliers_of_fit | (nearest > fair._spread[:, None, None]))).sum() > n_lost:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
@@ -290,17 +308,16 @@ class Arbiter:
 
         The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
         """
-        return self._scores(self._errors(candidate))
+        return self._scores(self._errors([candidate])[0])
 
     def _scores(self, errors: FloatArray) -> Scores:
-        """Scores of errors ``(K, n_after, n_s)``."""
-        spread, no_change = self._sizes
+        """Scores of errors ``(n_s, K, n_after)``."""
         losses, found = list[FloatArray](), list[FloatArray]()
         squares = np.where(self._known, np.square(errors), 0.0)
-        for n, count, size in zip(self._n_rows, self._counts, no_change, strict=True):
-            mse = np.where(count > 0, squares[:, :n].sum(axis=1) / np.maximum(count, 1), np.nan)
-            losses.append(np.log1p(np.minimum(mse / np.square(spread), _LOST)))
-            found.append(_medians(mse / np.square(size)))
+        for n, count, size in zip(self._n_rows, self._counts, self._no_change, strict=True):
+            mse = np.where(count > 0, squares[:, :, :n].sum(axis=2) / np.maximum(count, 1), np.nan)
+            losses.append(np.log1p(np.minimum(mse.T / np.square(self._spread), _LOST)))
+            found.append(_medians(mse / np.square(size)[:, None]))
         by_horizon = _means(np.array(losses))
         of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
         return Scores(np.sqrt(_means(np.array(found))), of_blocks)
@@ -308,24 +325,34 @@ class Arbiter:
     def _block_scales(self, errors: FloatArray) -> FloatArray:
         """Geometric means over the signals of robust scales ``(n_blocks,)`` of errors in each block; NaN if unknown."""
         blocks = [self.block == k for k in range(self.left_out.shape[1])]
-        return np.exp(_means(np.log(np.array([_scale(errors[x], self._known[x]) for x in blocks]) + _TINY)))
+        return np.exp(_means(np.log(np.array([_scale(errors[:, x], self._known[:, x]) for x in blocks]) + _TINY)))
 
-    def _errors(self, candidate: Candidate) -> FloatArray:
-        """Errors ``(K, n_after, n_s)`` of the predicted rows."""
-        segments = replace(self.segments, acting=candidate.acting, intervals=candidate.intervals)
-        intervals, columns = segments.intervals, segments.columns
-        lanes = candidate.without_blocks(self.left_out)[None]
-        weights = (intervals.sampled & self.inlying)[:, columns] / np.square(self.noise[columns])
+    def _errors(self, candidates: Sequence[Candidate]) -> list[FloatArray]:
+        """Errors ``(n_s, K, n_after)`` of the predicted samples, of each candidate."""
+        found = dict[int, FloatArray]()
+        for alike in {(x.acting, x.intervals): None for x in candidates}:
+            some = [k for k, x in enumerate(candidates) if (x.acting, x.intervals) == alike]
+            found |= zip(some, self._errors_with(*alike, [candidates[k] for k in some]), strict=True)
+        return [found[k] for k in range(len(candidates))]
+
+    def _errors_with(
+        self, acting: ActingInputs, intervals: ShootingIntervals, candidates: Sequence[Candidate]
+    ) -> Iterator[FloatArray]:
+        """Errors of the predicted samples, of candidates with the same inputs and logs."""
+        segments = replace(self.segments, acting=acting, intervals=intervals)
+        lanes = np.array([x.without_blocks(self.left_out) for x in candidates])
+        weights = (intervals.sampled & self.inlying)[:, segments.columns] / np.square(self.noise[segments.columns])
         states, spread = prior_states(intervals, self.motion, self.inlying, segments.starts)
         before = replace(segments, n_rows=self.n_before)
-        states = before.estimated_states(lanes, states[None], spread, weights)
-        return np.array(segments.errors(lanes, states)[0][:, self._after])
+        states = before.estimated_states(lanes, np.repeat(states[None], len(lanes), axis=0), spread, weights)
+        for own, x in zip(lanes, states, strict=True):
+            after = segments.errors(own[None], x[None])[0][:, self._after]
+            yield np.ascontiguousarray(after.transpose(2, 0, 1)[self._places])
 
 
 def _scale(errors: FloatArray, known: BoolArray) -> FloatArray:
-    """Robust scale ``(n_s,)`` of errors ``(K, n, n_s)``; NaN of signals of which few samples are known."""
-    columns = (-1, errors.shape[2])
-    return lower_scale(errors.reshape(columns), known.reshape(columns))
+    """Robust scale ``(n_s,)`` of errors ``(n_s, K, n)``; NaN of signals of which few samples are known."""
+    return lower_scale(errors.reshape(len(errors), -1).T, known.reshape(len(known), -1).T)
 
 
 def _means(values: FloatArray) -> FloatArray:
@@ -336,24 +363,16 @@ def _means(values: FloatArray) -> FloatArray:
 
 
 def _medians(values: FloatArray) -> FloatArray:
-    """Medians ``(..., n_s)`` of the finite numbers of each column ``(..., n, n_s)``; NaN where there are none."""
+    """Medians of the finite numbers along the last axis; NaN where there are none."""
     known = np.isfinite(values)
-    ordered, count = np.sort(np.where(known, values, np.nan), axis=-2), known.sum(axis=-2, keepdims=True)
-    pair = (np.take_along_axis(ordered, np.maximum(k, 0), -2) for k in ((count - 1) // 2, count // 2))
-    return np.where(count > 0, 0.5 * sum(pair), np.nan)[..., 0, :]
-
-
-def _predicted(segments: Segments) -> BoolArray:
-    """Mask of the compared signals whose prediction counts: states and sensors; without these, all."""
-    model = segments.intervals.model
-    names = [model.signals[k] for k in segments.columns]
-    found = np.array([n in model.state or n in model.sensors for n in names])
-    return found if found.any() else np.ones(len(names), bool)
+    ordered, count = np.sort(np.where(known, values, np.nan)), known.sum(axis=-1, keepdims=True)
+    pair = (np.take_along_axis(ordered, np.maximum(k, 0), -1) for k in ((count - 1) // 2, count // 2))
+    return np.where(count > 0, 0.5 * sum(pair), np.nan)[..., 0]
 
 
 def _root_mean_squares(values: FloatArray) -> FloatArray:
-    """Root mean squares ``(n,)`` of the finite numbers of each column; NaN where there are none."""
-    return np.asarray(np.sqrt(_means(np.square(values).T)))
+    """Root mean squares of the finite numbers along the last axis; NaN where there are none."""
+    return np.asarray(np.sqrt(_means(np.square(values))))
 
 
 def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:

@@ -104,14 +104,18 @@ class Mixture:
         """Probability ``(N, n_s)`` that each sample is not an outlier; 0 where it is missing (the E step)."""
         found = np.empty(residuals.shape)
         for rows in row_blocks(len(residuals), _ROWS_AT_A_TIME):
-            self._inlying(residuals[rows], known[rows], found[rows])
+            core = self._core(residuals[rows], found[rows])
+            self._inlying(core, core + self._uniform, known[rows])
         return found
 
-    def _inlying(self, residuals: FloatArray, known: BoolArray, out: FloatArray) -> None:
-        """Write the result of `inlying`."""
-        core, uniform = self._core(residuals, out), self.pi / (2.0 * self.span)
-        total = core + uniform
-        if (uniform > 0.0).all():
+    @property
+    def _uniform(self) -> FloatArray:
+        """Density ``(n_s,)`` of outliers with their share."""
+        return self.pi / (2.0 * self.span)
+
+    def _inlying(self, core: FloatArray, total: FloatArray, known: BoolArray) -> None:
+        """Turn the density of the Gaussian into the result of `inlying`."""
+        if (self._uniform > 0.0).all():
             core /= total
         else:
             is_possible = total > 0.0
@@ -124,19 +128,29 @@ class Mixture:
         """Negative log-likelihood ``(N, n_s)`` of each sample; 0 where it is missing."""
         found = np.empty(residuals.shape)
         for rows in row_blocks(len(residuals), _ROWS_AT_A_TIME):
-            self._loss(residuals[rows], known[rows], found[rows])
+            total = self._core(residuals[rows], found[rows])
+            total += self._uniform
+            self._losses(total, residuals[rows], known[rows])
         return found
+
+    def losses_and_inlying(self, residuals: FloatArray, known: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Results of `negative_log_likelihood` and `inlying`, from the same densities."""
+        losses, inlying = np.empty(residuals.shape), np.empty(residuals.shape)
+        for rows in row_blocks(len(residuals), _ROWS_AT_A_TIME):
+            core = self._core(residuals[rows], inlying[rows])
+            total = np.add(core, self._uniform, out=losses[rows])
+            self._inlying(core, total, known[rows])
+            self._losses(total, residuals[rows], known[rows])
+        return losses, inlying
 
     def loss(self, residuals: FloatArray, known: BoolArray) -> float:
         """Sum of `negative_log_likelihood`."""
         parts = (self.negative_log_likelihood(residuals[k], known[k]).sum() for k in row_blocks(len(residuals)))
         return float(sum(parts))
 
-    def _loss(self, residuals: FloatArray, known: BoolArray, out: FloatArray) -> None:
-        """Write the result of `negative_log_likelihood`."""
-        total, uniform = self._core(residuals, out), self.pi / (2.0 * self.span)
-        total += uniform
-        if (uniform > 0.0).all():
+    def _losses(self, total: FloatArray, residuals: FloatArray, known: BoolArray) -> None:
+        """Turn densities into the result of `negative_log_likelihood`."""
+        if (self._uniform > 0.0).all():
             np.negative(np.log(total, out=total), out=total)
         else:
             with np.errstate(over="ignore"):

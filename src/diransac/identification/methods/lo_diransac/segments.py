@@ -276,7 +276,7 @@ def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
         True where nothing is measured.
     """
     apart = np.where(intervals.known, np.nan_to_num(intervals.measured - motion.signals), 0.0)
-    return np.asarray(~(np.abs(apart) > OUTLYING * lower_scale(apart.copy(), intervals.known)))
+    return np.asarray(~(np.abs(apart) > OUTLYING * lower_scale(apart, intervals.known)))
 
 
 def prior_states(

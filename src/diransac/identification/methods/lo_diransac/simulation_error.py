@@ -15,14 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.estimate import LogEstimate
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
+from diransac.identification.methods.lo_diransac.mixture import Mixture, NoiseSums, lower_scale
 from diransac.identification.methods.lo_diransac.segments import (
     ActingInputs,
     Segments,
@@ -50,6 +50,8 @@ _WHOLE_ROW = 1.0 / 12.0
 _STEPS, _FEW_STEPS, _CONVERGED, _NOISE_MOVES = 25, 3, 0.1, 0.03
 """Steps at most, and of a solution that is close to another; change of parameters, standard errors, and relative change
 of the noise that end them."""
+_HOPELESS = 0.1
+"""Loss of log-likelihood per sample, of errors a tenth larger, from which on a solution is not followed to its end."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
 _RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
@@ -90,11 +92,11 @@ def simulation_error_candidates(
     first = _from_starts(intervals, motion, starts, actings[0], lengths[0], outliers=outliers)
     if first is None:
         return []
-    chain = [min([first, *(first.with_inputs(x) for x in actings[1:])], key=lambda x: x.cost)]
+    chain = [reduce(_Solution.likelier, (first.with_inputs(x) for x in actings[1:]), first)]
     for length in lengths:
         chain.append(chain[-1].grown(length).descended())
     last, taken = chain[-1], chain[-1].segments.acting
-    others = [last.with_inputs(x) for x in actings if x is not taken]
+    others = [last.with_inputs(x).descended(rival=last.cost) for x in actings if x is not taken]
     return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
 
 
@@ -177,8 +179,8 @@ def _from_starts(
         return None
     noise = _first_noise(some, motion.spread, outliers=outliers)
     order = np.argsort(_scores(some, motion, starts, noise), kind="stable")[:_FOLLOWED]
-    found = [_Solution.begin(some, motion, starts[k], noise).descended() for k in order]
-    return min(found, key=lambda x: x.cost)
+    first, *others = (_Solution.begin(some, motion, starts[k], noise) for k in order)
+    return reduce(_Solution.likelier, others, first.descended())
 
 
 def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
@@ -231,6 +233,8 @@ class _Solution:
         Of the compared signals.
     states, mean, spread : (K, n_x), (K, n_x) and (n_x,) array
         Initial states, and means and standard deviations of their prior.
+    errors : (K n_rows, n_s) array
+        Simulated less measured samples.
     """
 
     segments: Segments
@@ -240,50 +244,57 @@ class _Solution:
     states: FloatArray
     mean: FloatArray
     spread: FloatArray
+    errors: FloatArray
 
     @classmethod
     def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
         """The solution with states that agree best with the samples of their segments."""
         lanes = np.repeat(parameters[None, None], len(segments), axis=1)
         states, mean, spread = _first_states(segments, motion, lanes, noise)
-        return cls(segments, motion, parameters, noise, states[0], mean, spread)
+        errors = _errors(segments, parameters, states[0])
+        return cls(segments, motion, parameters, noise, states[0], mean, spread, errors)
 
-    @cached_property
-    def _lanes(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters and states of the lanes of one batch."""
-        return np.repeat(self.parameters[None, None], len(self.segments), axis=1), self.states[None]
-
-    @cached_property
-    def errors(self) -> FloatArray:
-        """Simulated less measured samples ``(K n_rows, n_s)``."""
-        return np.asarray(self.segments.errors(*self._lanes)[0].reshape(-1, len(self.segments.columns)))
+    def _at(self, segments: Segments, parameters: FloatArray, states: FloatArray) -> _Solution:
+        """The solution with other segments, parameters and states."""
+        errors = _errors(segments, parameters, states)
+        return replace(self, segments=segments, parameters=parameters, states=states, errors=errors)
 
     @cached_property
     def _known(self) -> BoolArray:
         return self.segments.known.reshape(self.errors.shape)
 
     @cached_property
+    def _losses_and_inlying(self) -> tuple[FloatArray, FloatArray]:
+        """Loss of each sample, and the probability that it is no outlier."""
+        return self.noise.losses_and_inlying(self.errors, self._known)
+
+    @cached_property
     def cost(self) -> float:
         """Negative logarithm of the probability of samples and states."""
         of_states = 0.5 * np.square((self.states - self.mean) / self.spread).sum()
-        return float(self.noise.loss(self.errors, self._known) + of_states)
+        return float(self._losses_and_inlying[0].sum() + of_states)
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
-        segments, (K, n_x) = self.segments, self.states.shape
-        inlying = self.noise.inlying(self.errors, self._known).reshape(segments.known.shape)
-        weights = segments.weights(inlying / np.square(self.noise.sigma))
-        sums = segments.gauss_newton(*self._lanes, weights)
-        own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
-        at = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own])
-        H, g = np.zeros((K, *2 * (n_x + len(self.parameters),))), np.zeros((K, n_x + len(self.parameters)))
-        k = np.flatnonzero(np.isfinite(sums.normal_matrix).all(axis=(1, 2)) & np.isfinite(sums.gradient).all(axis=1))
-        H[k[:, None, None], at[k][:, :, None], at[k][:, None, :]] = sums.normal_matrix[k]
-        g[k[:, None], at[k]] = sums.gradient[k]
+        segments, n_x = self.segments, self.states.shape[1]
+        weights = segments.weights(self._losses_and_inlying[1] / np.square(self.noise.sigma))
+        sums = segments.gauss_newton(*_lanes(segments, self.parameters, self.states), weights)
+        H, g = sums.normal_matrix, sums.gradient
+        if not segments.intervals.layout.is_shared:
+            H, g = self._spread_out(H, g)
         H[:, :n_x, :n_x] += np.diag(self.spread**-2.0)
         g[:, :n_x] += (self.states - self.mean) / np.square(self.spread)
         return H, g
+
+    def _spread_out(self, H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Matrix and gradient of states and all parameters, from those of the parameters of each segment's log."""
+        segments, (K, n_x) = self.segments, self.states.shape
+        own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
+        at, n = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own]), n_x + len(self.parameters)
+        matrix, gradient, k = np.zeros((K, n, n)), np.zeros((K, n)), np.arange(K)
+        matrix[k[:, None, None], at[:, :, None], at[:, None, :]], gradient[k[:, None], at] = H, g
+        return matrix, gradient
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
@@ -297,19 +308,29 @@ class _Solution:
         following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
         return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
-    def descended(self, steps: int = _STEPS) -> _Solution:
-        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM)."""
-        now, damping = self, _DAMPING
-        for _ in range(steps):
+    def likelier(self, other: _Solution) -> _Solution:
+        """The likelier of this solution and another one, which descends as long as it may become so."""
+        found = other.descended(rival=self.cost)
+        return found if found.cost < self.cost else self
+
+    def descended(self, steps: int = _STEPS, rival: float = np.inf) -> _Solution:
+        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM).
+
+        They end where as much gain in all others would leave the samples clearly less likely than a rival does.
+        """
+        now, damping, hopeless = self, _DAMPING, rival + _HOPELESS * np.count_nonzero(self._known)
+        for left in reversed(range(steps)):
             check_time()
-            noise = now.noise.updated(now.errors, now._known, outliers=bool(now.noise.pi.any()))
+            cost = now.cost
+            sums = NoiseSums.of(now.errors, now._known, now._losses_and_inlying[1])
+            noise = now.noise.of_sums(sums, outliers=bool(now.noise.pi.any()))
             is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
             now = replace(now, noise=noise)
             then, change, damping = now._stepped(damping)
             if then is None:
                 break
             now = then
-            if change < _CONVERGED and is_steady:
+            if (change < _CONVERGED and is_steady) or now.cost - left * (cost - now.cost) > hopeless:
                 break
         return now
 
@@ -321,7 +342,7 @@ class _Solution:
             matrix, gradient = _with_priors(intervals, self.parameters, parts)
             p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
             change = p - self.parameters
-            then = replace(self, parameters=p, states=self.states - following @ np.append(change, 1.0))
+            then = self._at(self.segments, p, self.states - following @ np.append(change, 1.0))
             if then.cost < self.cost:
                 sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
                 return then, float(sizes.max()), least
@@ -332,12 +353,12 @@ class _Solution:
         """The solution over all segments of a length, of which states and noise are their own."""
         longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
         found = _Solution.begin(longer, self.motion, self.parameters, self.noise)
-        scale = np.nan_to_num(lower_scale(found.errors.copy(), found._known), nan=1.0)
+        scale = np.nan_to_num(lower_scale(found.errors, found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
 
-    def with_inputs(self, acting: ActingInputs, steps: int = _STEPS) -> _Solution:
-        """The solution with inputs that act otherwise, after some steps from this one."""
-        return replace(self, segments=replace(self.segments, acting=acting)).descended(steps)
+    def with_inputs(self, acting: ActingInputs) -> _Solution:
+        """The solution with inputs that act otherwise, at the same parameters and states."""
+        return self._at(replace(self.segments, acting=acting), self.parameters, self.states)
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
@@ -367,7 +388,7 @@ class _Solution:
         while step:
             for x in (at - step, at + step):
                 if x not in tried and abs(x) < one.n_rows:
-                    tried[x] = self.with_inputs(one.acting.shifted(one.intervals, x), _FEW_STEPS)
+                    tried[x] = self.with_inputs(one.acting.shifted(one.intervals, x)).descended(_FEW_STEPS)
             best = min(tried, key=lambda x: tried[x].cost)
             at, step = best, (2 * step if best != at else step // 2)
         if not {at - 1, at + 1} <= tried.keys():
@@ -378,18 +399,29 @@ class _Solution:
 
     def costs_without(self, blocks: Blocks) -> FloatArray:
         """Negative log-likelihood of the samples without each block."""
-        cost = self.noise.negative_log_likelihood(self.errors, self._known)
-        each = cost.reshape(len(self.segments), -1).sum(axis=1)
+        each = self._losses_and_inlying[0].reshape(len(self.segments), -1).sum(axis=1)
         block = blocks.of_row[self.segments.starts + self.segments.n_rows // 2]
         return np.array([each[block != k].sum() for k in range(blocks.n)])
 
     @property
     def simulated(self) -> Motion:
         """The motion of the segments; the smoothed one in rows that none covers."""
-        series, signals = self.segments.trajectories(*self._lanes)[0], self.motion.signals.copy()
+        lanes, signals = _lanes(self.segments, self.parameters, self.states), self.motion.signals.copy()
+        series = self.segments.trajectories(*lanes)[0]
         finite = np.isfinite(series).all(axis=(1, 2))
         signals[self.segments.rows[finite]] = series[finite]
         return replace(self.motion, signals=signals)
+
+
+def _lanes(segments: Segments, parameters: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Parameters and states of the lanes of one batch, from those that all segments share, and ``(K, n_x)``."""
+    return np.repeat(parameters[None, None], len(segments), axis=1), states[None]
+
+
+def _errors(segments: Segments, parameters: FloatArray, states: FloatArray) -> FloatArray:
+    """Simulated less measured samples ``(K n_rows, n_s)``; arguments as of `_lanes`."""
+    errors = segments.errors(*_lanes(segments, parameters, states))[0]
+    return np.asarray(errors.reshape(-1, len(segments.columns)))
 
 
 def _with_priors(intervals: ShootingIntervals, p: FloatArray, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
