@@ -152,7 +152,13 @@ def run_trials(study: str, keys: Sequence[Key]) -> list[dict[str, Any]]:
 # A level and its cases -----------------------------------------------------------------------------------------------
 @lru_cache(maxsize=8)
 def _point(study: str, level: str) -> _Point:
-    return _Point(load(json.loads(study)).at(level), level)
+    return _Point(_study(study).at(level), level)
+
+
+@lru_cache(maxsize=1)
+def _study(text: str) -> Study:
+    """The study of a JSON text; reading it checks every level."""
+    return load(json.loads(text))
 
 
 class _Point:
