@@ -16,6 +16,7 @@ import numpy as np
 import diransac as dr
 from diransac.model.library import TABLE_I
 from diransac.study import Study, load
+from diransac.study.engine import Processes
 from diransac.study.summary import Summary, TrackingErrors, summarise
 
 NEAR = 0.1
@@ -340,12 +341,15 @@ def main() -> None:
     given.stores.mkdir(parents=True, exist_ok=True)
     chosen = studies() if given.only is None else {name: studies()[name] for name in given.only.split(",")}
     wall = {}
-    for name, study in chosen.items():
-        methods = None if given.methods is None or "i-diransac" not in study.methods else given.methods.split(",")
-        begin = time.perf_counter()
-        dr.run_study(study, store=given.stores / f"{name}.db", jobs=given.jobs, trials=given.trials, methods=methods)
-        wall[name] = time.perf_counter() - begin
-        print(f"{name}: {wall[name]:.0f} s", flush=True)
+    with Processes(given.jobs) as workers:  # which keep what they have imported and compiled
+        for name, study in chosen.items():
+            methods = None if given.methods is None or "i-diransac" not in study.methods else given.methods.split(",")
+            begin, kept = time.perf_counter(), given.stores / f"{name}.db"
+            dr.run_study(
+                study, store=kept, executor=workers, tasks=2 * given.jobs, trials=given.trials, methods=methods
+            )
+            wall[name] = time.perf_counter() - begin
+            print(f"{name}: {wall[name]:.0f} s", flush=True)
     found = {name: summarise(given.stores / f"{name}.db") for name in chosen}
     for name, summary in found.items():
         print(f"\n## {name}")

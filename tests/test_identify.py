@@ -139,7 +139,8 @@ def test_results_do_not_depend_on_earlier_methods_of_the_same_logs():
         for method in trial:
             for seed in seeds:
                 alone = dr.identify(MODEL, some, method, seed=seed)
-                assert json.dumps(together.by(method, seed).to_dict()) == json.dumps(alone.to_dict())
+                untested = replace(alone, estimate=replace(alone.estimate, mistakes=(), n_columns_tested=0))
+                assert json.dumps(together.by(method, seed).to_dict()) == json.dumps(untested.to_dict())
 
 
 def test_what_methods_share_is_freed_with_the_dataset():

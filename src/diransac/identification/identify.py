@@ -216,8 +216,9 @@ def _check_arguments(model: object, seed: object) -> None:
 class Identification:
     """Identification of a model from the same logs by one method after another.
 
-    Each result is that of `identify`.  Methods share what does not depend on them: the logs bound to the model, sums of
-    the regression, and random samples with their scores.
+    Each result is that of `identify` without the tests of columns, which take several times as long as least squares.
+    Methods share what does not depend on them: the logs bound to the model, sums of the regression, and random samples
+    with their scores.
 
     Parameters
     ----------
@@ -244,7 +245,7 @@ class Identification:
         several = len(self._given) > 1
         task = _Task(self._known, self._given, method, int(seed), None, several, self._dataset)
         with numerical_failures(self._given):
-            return task.run(self._given)
+            return task.fitted(self._given)[0]
 
     def _dataset(self, *arguments: Any, **options: Any) -> Dataset:
         """The dataset of an earlier method with the same arguments of `Dataset.of`, or a new one."""
@@ -277,7 +278,12 @@ class _Task:
 
     @single_threaded()  # matrices are small: more threads would only wait for one another
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
-        """Identify from prepared logs."""
+        """The result from prepared logs, with findings on mistakes of their columns."""
+        return _with_tested_columns(*self.fitted(logs, progress))
+
+    @single_threaded()
+    def fitted(self, logs: Sequence[Log], progress: Callback | None = None) -> tuple[Result, Dataset]:
+        """The result from prepared logs, whose columns are not tested, and the dataset."""
         logs = logs if self.method.needs_all_signals else [log.measured for log in logs]
         required = set(self.known.model.required_signals)
         pointwise = self.method.needs_all_signals or all(required <= set(log.signals) for log in logs)
@@ -317,7 +323,7 @@ class _Task:
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),
         )
-        return _with_tested_columns(result, dataset)
+        return result, dataset
 
     def _observed(self, logs: Sequence[Log]) -> tuple[KnownParameters, tuple[str, ...]]:
         """The known parameters of the model with the sensors that the method can use, and notes on the others."""
@@ -372,7 +378,7 @@ class _Task:
         try:
             pairs = zip(self.given, bandwidths, strict=True)
             derived = [preprocessing.differentiate(log, self.known.model, x) for log, x in pairs]
-            other = alone.run(derived, progress).parameters
+            other = alone.fitted(derived, progress)[0].parameters
             check_time()
         except TimeLimitError:
             raise

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from importlib.metadata import version
 from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +141,8 @@ def run_trials(study: str, keys: Sequence[Key]) -> list[dict[str, Any]]:
     cases = [_Case(point, trial, label) for _, trial, label in keys]
     with single_threaded():  # all cores run trials
         point.record(cases)
-        for _, of_trial in groupby(cases, key=attrgetter("trial")):
-            _identify(list(of_trial))
+        for _, of_log in groupby(cases, key=lambda case: case.log and case.log.fingerprint):
+            _identify(list(of_log))
         for shape in point.study.evaluation.trajectories:
             _evaluate(point, [case for case in cases if case.found], shape)
     return [case.row() for case in cases]
@@ -152,7 +151,13 @@ def run_trials(study: str, keys: Sequence[Key]) -> list[dict[str, Any]]:
 # A level and its cases -----------------------------------------------------------------------------------------------
 @lru_cache(maxsize=8)
 def _point(study: str, level: str) -> _Point:
-    return _Point(load(json.loads(study)).at(level), level)
+    return _Point(_study(study).at(level), level)
+
+
+@lru_cache(maxsize=1)
+def _study(text: str) -> Study:
+    """The study of a JSON text; reading it checks every level."""
+    return load(json.loads(text))
 
 
 class _Point:
@@ -279,7 +284,7 @@ class _Case:
 
 
 def _identify(cases: Sequence[_Case]) -> None:
-    """Identify parameters in the cases of a trial, which share what does not depend on the method."""
+    """Identify parameters from the log that all cases have, and share what depends on neither method nor seed."""
     log = cases[0].log
     if log is None:
         return

@@ -12,7 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.preprocessing.continuity import unit_quaternions
 from diransac.errors import PlanningError, SettingsError
-from diransac.flight.planning.solver import TIME_LIMIT, Solution, Strategy, interior_point
+from diransac.flight.planning.solver import TIME_LIMIT, Solution, Start, interior_point
 from diransac.flight.planning.task import TIME_STEP, Reference, Task, sampled, task_of
 from diransac.flight.planning.transcription import Guess, Program
 from diransac.flight.trajectory import InputLimits, Trajectory, half_ranges
@@ -138,25 +138,22 @@ class _Search:
     deadline: float
 
     def fixed(self, rows: tuple[int, ...], guess: Guess | None) -> Trajectory:
-        """Plan whose segments have these numbers of rows, from a guess, else straight lines, else full Newton steps.
-
-        Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
-        curved that line searches stall; full steps converge.
-        """
+        """Plan whose segments have these numbers of rows: from a guess, else straight lines, else where these led."""
         program = Program(self.task, rows)
         straight = program.unknowns_of(_straight(self.task, TIME_STEP * np.array(rows)))
-        attempts: list[tuple[FloatArray, Strategy]] = [(straight, "line search"), (straight, "full steps")]
+        attempts: list[tuple[FloatArray, Start]] = [(straight, "cold")]
         if guess is not None:
-            attempts.insert(0, (program.unknowns_of(guess), "warm start"))
-        for k, (unknowns, strategy) in enumerate(attempts, start=1):
-            # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
-            share = 1.0 if k == len(attempts) else 0.4
-            iterations = max(1, round(share * self.max_iterations))
-            solution = interior_point(program, unknowns, iterations, self.deadline, strategy)
-            if solution.success:
-                return program.trajectory(solution.unknowns)
-            if solution.summary == TIME_LIMIT:
+            attempts.insert(0, (program.unknowns_of(guess), "warm"))
+        # Fraction of the iterations for every attempt but the last: most plans take a tenth of them.
+        iterations = max(1, round(0.4 * self.max_iterations))
+        for unknowns, start in attempts:
+            solution = interior_point(program, unknowns, iterations, self.deadline, start)
+            if solution.success or solution.summary == TIME_LIMIT:
                 break
+        else:
+            solution = interior_point(program, solution.unknowns, self.max_iterations, self.deadline)
+        if solution.success:
+            return program.trajectory(solution.unknowns)
         raise PlanningError(_explanation(self.task, rows, solution, self.time_limit))
 
     def free(self, guess: Guess | None) -> Trajectory:
@@ -165,8 +162,8 @@ class _Search:
         n = len(program.intervals)
         durations = np.full(n, 1.0 if guess is None else guess[0][-1] / n)
         unknowns = program.unknowns_of(guess or _straight(self.task, durations), durations)
-        strategy: Strategy = "line search" if guess is None else "warm start"
-        solution = interior_point(program, unknowns, self.max_iterations, self.deadline, strategy)
+        start: Start = "cold" if guess is None else "warm"
+        solution = interior_point(program, unknowns, self.max_iterations, self.deadline, start)
         if not solution.success:
             raise PlanningError(
                 f"no durations were found for which the plan works: {solution.summary}; "
@@ -179,7 +176,7 @@ class _Search:
             rows = tuple(int(k) + more for k in shortest)
             whole = Program(self.task, rows)
             along = whole.unknowns_of(program.stretched(solution.unknowns, TIME_STEP * np.array(rows)))
-            rounded = interior_point(whole, along, self.max_iterations, self.deadline, "warm start")
+            rounded = interior_point(whole, along, self.max_iterations, self.deadline, "warm")
             if rounded.success:
                 return whole.trajectory(rounded.unknowns)
         raise PlanningError(_explanation(self.task, rows, rounded, self.time_limit))

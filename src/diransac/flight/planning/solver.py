@@ -22,15 +22,14 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray
 from diransac.flight.planning.transcription import Program
 
-Strategy: TypeAlias = Literal["line search", "warm start", "full steps"]
-"""``warm start``: the guess is close to the solution, the barrier starts small; ``full steps``: without line search."""
+Start: TypeAlias = Literal["cold", "warm"]
+"""``warm``: the guess is close to the solution, and the barrier starts small."""
 
 TIME_LIMIT = "time limit reached"
 
-_STRATEGIES: dict[Strategy, dict[str, Any]] = {
-    "line search": {},
-    "warm start": {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6},
-    "full steps": {"accept_every_trial_step": "yes", "mu_init": 1e-3},
+_STARTS: dict[Start, dict[str, Any]] = {
+    "cold": {},
+    "warm": {"mu_init": 1e-4, "bound_push": 1e-6, "bound_frac": 1e-6},
 }
 
 
@@ -55,7 +54,7 @@ class _OutOfTime(Exception):
 
 
 def interior_point(
-    program: Program, guess: FloatArray, iterations: int, deadline: float, strategy: Strategy = "line search"
+    program: Program, guess: FloatArray, iterations: int, deadline: float, start: Start = "cold"
 ) -> Solution:
     """Solution by IPOPT from a first iterate (n_unknowns,), until a deadline by the monotonic clock, s.
 
@@ -64,6 +63,10 @@ def interior_point(
     search = _Functions(program, deadline)
     # Without a file of options; the default, ipopt.opt of the working directory, may load a library.
     fixed = {"print_level": 0, "sb": "yes", "bound_relax_factor": 0.0, "tol": 1e-9, "option_file_name": ""}
+    # Parameters far from plausible ones, such as an inertia of a fiftieth of the true one, make the constraints so
+    # curved that line searches stall: the fifth shorter step is taken whatever it brings. With three, turns of a body
+    # end in poor optima.
+    line_search = {"accept_after_max_steps": 5}
     options: dict[str, Any] = {
         "print_time": False,
         "error_on_fail": False,
@@ -71,7 +74,7 @@ def interior_point(
         "no_nlp_grad": True,
         "calc_lam_p": False,
         "cache": search.functions,
-        "ipopt": {**fixed, **_STRATEGIES[strategy], "max_iter": iterations},
+        "ipopt": {**fixed, **line_search, **_STARTS[start], "max_iter": iterations},
     }
     solver = ca.nlpsol("plan", "ipopt", search.functions["nlp"], options)
     with _interrupts_noted() as search.interrupts:

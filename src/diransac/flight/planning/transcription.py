@@ -67,7 +67,7 @@ class Program:
         self.lower, self.upper = self._limits(relaxed)
         self._stage = stage_of(model, self.free_time)
         self._stages = Stages(self._stage, task.parameters, self.steps, self._objective(relaxed))
-        self._at = np.zeros(0)
+        self._at = b""
         self._costs: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._intervals: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
@@ -146,7 +146,8 @@ class Program:
     def hessian(self, unknowns: FloatArray, objective_factor: float, multipliers: FloatArray) -> FloatArray:
         """Upper triangle of the Hessian of ``objective_factor * objective + multipliers . constraints``."""
         n_x, n_s = self.states.shape[1], self._of_knots.shape[1]
-        weights = np.pad(-multipliers.reshape(-1, n_x), [(0, 0), (0, n_s - n_x)])
+        weights = np.zeros((len(self._of_stages), n_s))
+        weights[:, :n_x] = -multipliers.reshape(-1, n_x)
         entries = (objective_factor * self._cost(unknowns)[2]).ravel()
         self._integrated(unknowns)
         curved = self._stages.curvature(weights)
@@ -183,10 +184,10 @@ class Program:
 
     def _move(self, unknowns: FloatArray) -> None:
         """Move to a point, unless this is it."""
-        if not np.array_equal(self._at, unknowns):
+        if self._at != (at := unknowns.tobytes()):
             self._costs = self._intervals = None
             self._stages.move(unknowns[self._of_knots], unknowns[self.inputs])
-            self._at = unknowns.copy()
+            self._at = at
 
     # ------------------------------------------------------------------ guesses and trajectories
 

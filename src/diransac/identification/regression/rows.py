@@ -135,6 +135,19 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     )
 
 
+def lacks_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> bool:
+    """True if ``b = 0`` in each finite row of ``W p = b``, so that zero solves it.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+    logs : sequence of MotionRows
+    """
+    rows, _ = _equations(model, layout, logs)
+    return len(rows) > 0 and not rows[:, -1].any()
+
+
 def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
     """Standard errors ``(n,)`` of least squares, from sums of scores over 30 batches of rows, in their order."""
     sums = np.add.reduceat(A * residuals[:, None], np.arange(0, len(A), max(1, len(A) // 30)), axis=0)

@@ -16,7 +16,14 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
-from diransac.identification.regression.rows import MotionRows, Solution, motion_rows, outside_bounds, solved
+from diransac.identification.regression.rows import (
+    MotionRows,
+    Solution,
+    lacks_known_terms,
+    motion_rows,
+    outside_bounds,
+    solved,
+)
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
@@ -152,10 +159,7 @@ def check_known_terms(dataset: Dataset) -> None:
     dataset : Dataset
     """
     model, logs = dataset.model, motion_rows(dataset)
-    if model.nonlinear_parameters:
-        return
-    found = solved(model, dataset.layout, logs)
-    if found is not None and not found.has_known_terms:
+    if not model.nonlinear_parameters and lacks_known_terms(model, dataset.layout, logs):
         raise IdentificationError(f"{dataset.source}: {_no_known_terms(model, dataset.layout, logs)}")
 
 
