@@ -188,8 +188,11 @@ class LocalSearch:
         if rival.exact or rest or flexible.cost < rival.cost:
             return None
         intervals, own = replace(rival.intervals, hold=flexible.intervals.hold), rival.refinement.fit
-        _, begin = split(flexible.intervals, flexible.refinement.fit, parts)
-        found = self._optimised(rival, intervals, with_residuals(intervals, begin))
+        try:
+            _, begin = split(flexible.intervals, flexible.refinement.fit, parts)
+            found = self._optimised(rival, intervals, with_residuals(intervals, begin))
+        except np.linalg.LinAlgError:
+            return None
         if found.cost > rival.cost + AS_LIKELY:
             return rival
         n, estimate = intervals.n_p, fitted_parameters(rival.intervals, own)
