@@ -14,6 +14,10 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
+_HUGE_PAGE = 2 << 20
+_AHEAD = 64 << 20
+"""Bytes of kept memory that the system clears in huge pages: in a fifth of the time."""
+
 
 def end_with_parent() -> None:
     """End this process once its parent has ended, also where that was killed."""
@@ -79,6 +83,8 @@ def _freed_memory_kept() -> Callable[[], object]:
     if not hasattr(libc, "gnu_get_libc_version"):
         return _nothing
     trim_threshold, mmap_threshold, mmap_max = -1, -3, -4  # options of mallopt(3)
+    libc.malloc.restype, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    libc.madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
 
     def undo() -> None:
         largest = 32 << 20  # threshold of a mapping that the allocator itself would choose
@@ -89,6 +95,9 @@ def _freed_memory_kept() -> Callable[[], object]:
 
     libc.mallopt(mmap_max, 0)
     libc.mallopt(trim_threshold, -1)  # never
+    block = libc.malloc(_AHEAD) or 0
+    libc.madvise(-(-block // _HUGE_PAGE) * _HUGE_PAGE, _AHEAD - _HUGE_PAGE, 14)  # MADV_HUGEPAGE of Linux
+    libc.free(block)
     return undo
 
 
@@ -112,9 +121,9 @@ single_threaded = _Setting(_one_blas_thread)
 memory_kept = _Setting(_freed_memory_kept)
 """``with memory_kept():`` freed arrays leave their memory to the next ones, and to the system at the end.
 
-glibc gives arrays of more than 32 MB back at once. The next one then waits for the system to clear new pages: a fit of
-a million rows, of which every temporary array is as large, would spend a quarter of its time there. Nothing changes
-with another allocator, or where the environment has options for this one.
+glibc gives arrays of more than 32 MB back at once, and at first those of more than 128 kB. The next one then waits for
+the system to clear new pages: a fit of a million rows, of which every temporary array is as large, would spend a
+quarter of its time there. Nothing changes with another allocator, or where the environment has options for this one.
 """
 
 module_path_safe = _Setting(_working_directory_off_module_path)

@@ -34,7 +34,7 @@ def main() -> None:
     warnings.showwarning = _show_warning
     # New objects between two garbage collections: those of imported modules live as long as the process of a
     # command.
-    gc.set_threshold(10_000)
+    gc.set_threshold(100_000)
     from diransac.cli.commands import app
     from diransac.user_files import leave_stdout
 

@@ -137,6 +137,7 @@ def _meanings(text: str) -> list[_Unit]:
     return units
 
 
+@functools.lru_cache(maxsize=4096)
 def _parse(text: str) -> _Unit | None:
     """Unit of a text, or None."""
     tokens = _tokens(text.translate(_SUPERSCRIPTS))

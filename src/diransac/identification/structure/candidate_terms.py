@@ -138,7 +138,7 @@ class CandidateTerms:
         entries, rows, columns = self._entries
         n = len(weights) // length
         found = np.zeros((n, self.terms[0].residuals.numel(), len(self)))
-        step, mapped = max(1, 4096 // length), cache(entries.map)
+        step, mapped = max(1, 256 // length), cache(entries.map)
         for k in range(0, n, step):
             part = slice(k * length, (k + step) * length)
             own = [x[part] for x in motion]

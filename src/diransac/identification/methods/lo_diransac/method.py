@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
 
 _GAUSSIAN = 10_000
 """Degrees of freedom of an interval whose covariance is not itself an estimate from few numbers."""
-_MANY_ROWS = 200_000
-"""Rows from which on temporary arrays are so large that the system's allocator gives them back at once."""
 
 
 @dataclass(frozen=True)
@@ -162,8 +160,7 @@ class LoDiransac(LoDiransacSettings):
             from diransac.identification.methods.lo_diransac.without_equations import estimated_by_simulation
 
             return estimated_by_simulation(self, dataset, int(seed), callback)
-        memory = memory_kept() if dataset.n_rows > _MANY_ROWS else nullcontext()
-        with memory:
+        with memory_kept():
             return _fitted(self, dataset, int(seed), callback)
 
     def estimates_of_logs(self, dataset: Dataset, seed: int, callback: Callback | None = None) -> list[LogEstimate]:
