@@ -9,7 +9,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from itertools import count, pairwise
+from itertools import pairwise
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -34,9 +34,6 @@ _WORTH_THREADS = 3e-4
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
-
-_NUMBERS = count()
-"""Numbers of the functions that were loaded, which are part of the names of their libraries."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +67,11 @@ class MachineCode:
     Attributes
     ----------
     call : takes the arguments of its signature; releases Python's lock while it runs
-    library : owns the memory
+    engine : owns the memory
     """
 
     call: Callable[..., None]
-    library: LLVM
+    engine: LLVM
 
 
 @dataclass(frozen=True)
@@ -103,12 +100,6 @@ def _binding() -> LLVM:
     return binding
 
 
-@cache
-def _linker() -> LLVM:
-    """LLVM's linker of object files, into the memory of this process."""
-    return _binding().create_lljit_compiler()
-
-
 def compile_function(
     emit: Callable[[], LLVM],
     definition: Iterable[str],
@@ -128,13 +119,15 @@ def compile_function(
     target : processor to compile for; this one by default
     parts : functions of other modules that the module declares and calls
     """
-    target, objects = target or Target.host(), _binding().JITLibraryBuilder().add_current_process().export_symbol(name)
+    binding, machine = _binding(), _machine(target or Target.host())
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
     for part in (*parts, Part(emit, definition, name)):
-        objects.add_object_img(_object_code(part.emit, _key(target, part.name, part.definition), target))
-    library = objects.link(_linker(), f"{name} {next(_NUMBERS)}")
+        code = _object_code(part.emit, _key(target or Target.host(), part.name, part.definition), machine)
+        engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
     kinds = {"pointer": ctypes.c_void_p, "integer": ctypes.c_int64, "number": ctypes.c_double}
     prototype = ctypes.CFUNCTYPE(None, *(kinds[kind] for kind in signature))
-    return MachineCode(prototype(library[name]), library)
+    return MachineCode(prototype(engine.get_function_address(name)), engine)
 
 
 def signature(n_arrays: int, n_integers: int) -> list[str]:
@@ -151,20 +144,20 @@ def _machine(target: Target) -> LLVM:
     return triple.create_target_machine(cpu=target.cpu, features=target.features, opt=1)
 
 
-def _object_code(emit: Callable[[], LLVM], key: str, target: Target) -> bytes:
+def _object_code(emit: Callable[[], LLVM], key: str, machine: LLVM) -> bytes:
     """Object file of a module, from the cache or compiled and kept there."""
     cache = CodeCache.of_user()
     if cache is not None and (kept := cache.read(key)) is not None:
         return kept
-    code = _awaited(_compiled, str(emit()), target)
+    code = _awaited(_compiled, str(emit()), machine)
     if cache is not None:
         cache.write(key, code)
     return code
 
 
-def _compiled(assembly: str, target: Target) -> bytes:
+def _compiled(assembly: str, machine: LLVM) -> bytes:
     """Object file of a module in LLVM's intermediate representation."""
-    parsed, machine = _binding().parse_assembly(assembly), _machine(target)
+    parsed = _binding().parse_assembly(assembly)
     _optimise(parsed, machine)
     return bytes(machine.emit_object(parsed))
 
