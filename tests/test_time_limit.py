@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -193,40 +194,81 @@ def test_ctrl_c_ends_a_loop_between_two_blocks(threads: int):
     assert len(begun) == n
 
 
-@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("n_blocks", [0, 1, 7, 100])
-@pytest.mark.parametrize("pause", [0.0, 2e-3])  # s; threads share long loops
-def test_every_block_runs_once(threads: int, n_blocks: int, pause: float):
-    done, seen = np.zeros(n_blocks, int), set[int]()
+@pytest.mark.parametrize("moment", [0.0, np.inf])
+def test_every_block_runs_once(threads: int, n_blocks: int, moment: float, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(machine_code, "_MOMENT", moment)
+    done, seen, both = np.zeros(n_blocks, int), set[int](), threading.Barrier(2, timeout=60.0)
+    is_shared = threads > 1 and moment == 0.0 and n_blocks > 1
 
     def loop(first: int, end: int) -> None:
-        if pause:
-            time.sleep(pause)
         done[first:end] += 1
-        seen.add(threading.get_ident())
+        if threading.get_ident() not in seen:
+            seen.add(threading.get_ident())
+            if is_shared:
+                both.wait()
 
     run_blocks(loop, [], n_blocks, threads)
     np.testing.assert_array_equal(done, 1)
-    if pause == 0.0 or threads == 1:
-        assert seen == {threading.get_ident()}
-    elif n_blocks == 100:
-        assert len(seen) > 1
+    assert len(seen) == (2 if is_shared else min(n_blocks, 1))
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("in_another", [False, True])
-def test_an_error_in_a_loop_is_raised(threads: int, in_another: bool):
+@pytest.mark.parametrize("kind", [ZeroDivisionError, IndexError])
+def test_an_error_in_a_loop_is_raised(threads: int, kind: type[Exception], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(machine_code, "_MOMENT", 0.0)
+
     def broken(first: int, end: int) -> None:
-        time.sleep(2e-3)
-        if in_another == (threading.current_thread() is not threading.main_thread()):
-            raise ZeroDivisionError("planted")
+        if first > 0:
+            raise kind("planted")
 
     call: Callable[..., None] = broken
-    if in_another and threads == 1:
-        run_blocks(call, [], 100, threads)
-    else:
-        with pytest.raises(ZeroDivisionError, match="planted"):
-            run_blocks(call, [], 100, threads)
+    with pytest.raises(kind, match="planted"):
+        run_blocks(call, [], 20, threads)
+
+
+def test_an_error_in_another_thread_is_raised(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(machine_code, "_MOMENT", 0.0)
+    both, seen = threading.Barrier(2, timeout=60.0), set[int]()
+
+    def broken(first: int, end: int) -> None:
+        if threading.get_ident() not in seen:
+            seen.add(threading.get_ident())
+            both.wait()
+        if threading.current_thread() is not threading.main_thread():
+            raise ZeroDivisionError("planted")
+
+    with pytest.raises(ZeroDivisionError, match="planted"):
+        run_blocks(broken, [], 20, 2)
+
+
+def test_no_thread_goes_on_where_another_cannot_begin(monkeypatch: pytest.MonkeyPatch):
+    """Arrays of a loop are gone once it is left."""
+    begun, refused, ran = threading.Event(), threading.Event(), list[int]()
+
+    class Exhausted(ThreadPoolExecutor):
+        def submit(self, *given: Any) -> Any:
+            if begun.is_set():
+                refused.set()
+                raise RuntimeError("can't start new thread")
+            found = super().submit(*given)
+            assert begun.wait(60.0)
+            return found
+
+    def loop(first: int, end: int) -> None:
+        ran.append(first)
+        begun.set()
+        assert refused.wait(60.0)
+
+    pool = Exhausted(1)
+    monkeypatch.setattr(machine_code, "_MOMENT", 0.0)
+    monkeypatch.setattr(machine_code, "_pool", lambda *_: pool)
+    with pytest.raises(RuntimeError, match="new thread"):
+        run_blocks(loop, [], 10**9, 3)
+    n = len(ran)
+    pool.shutdown()
+    assert len(ran) == n
 
 
 def test_a_search_for_mistakes_that_time_ended_is_made_again():

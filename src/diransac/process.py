@@ -95,9 +95,9 @@ def _freed_memory_kept() -> Callable[[], object]:
 
     libc.mallopt(mmap_max, 0)
     libc.mallopt(trim_threshold, -1)  # never
-    block = libc.malloc(_AHEAD) or 0
-    libc.madvise(-(-block // _HUGE_PAGE) * _HUGE_PAGE, _AHEAD - _HUGE_PAGE, 14)  # MADV_HUGEPAGE of Linux
-    libc.free(block)
+    if block := libc.malloc(_AHEAD):
+        libc.madvise(-(-block // _HUGE_PAGE) * _HUGE_PAGE, _AHEAD - _HUGE_PAGE, 14)  # MADV_HUGEPAGE of Linux
+        libc.free(block)
     return undo
 
 

@@ -283,7 +283,7 @@ class _Task:
 
     @single_threaded()
     def fitted(self, logs: Sequence[Log], progress: Callback | None = None) -> tuple[Result, Dataset]:
-        """The result from prepared logs, whose columns are not tested, and the dataset."""
+        """The result from prepared logs, without findings on mistakes of their columns, and the dataset."""
         logs = logs if self.method.needs_all_signals else [log.measured for log in logs]
         required = set(self.known.model.required_signals)
         pointwise = self.method.needs_all_signals or all(required <= set(log.signals) for log in logs)

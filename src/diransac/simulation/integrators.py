@@ -80,7 +80,7 @@ def input_columns(hold: str, inputs: FloatArray, substeps: int, first_rows: IntA
                 second[start + 1 : end - 2] = 0.5 * (bends[:-1] + bends[1:])
         first -= (substeps - 1) / (2 * substeps**2) * second
         second /= substeps**2
-    return columns.reshape(len(inputs), -1)
+    return columns.reshape(len(inputs), 3 * inputs.shape[1])
 
 
 def interpolated(u: Any, first: Any, second: Any, fraction: Any) -> Any:

@@ -141,7 +141,7 @@ def run_trials(study: str, keys: Sequence[Key]) -> list[dict[str, Any]]:
     cases = [_Case(point, trial, label) for _, trial, label in keys]
     with single_threaded():  # all cores run trials
         point.record(cases)
-        for _, of_log in groupby(cases, key=lambda case: case.log and case.log.fingerprint):
+        for _, of_log in groupby(cases, key=lambda x: None if x.log is None else x.log.fingerprint):
             _identify(list(of_log))
         for shape in point.study.evaluation.trajectories:
             _evaluate(point, [case for case in cases if case.found], shape)

@@ -151,7 +151,8 @@ class _Search:
             if solution.success or solution.summary == TIME_LIMIT:
                 break
         else:
-            solution = interior_point(program, solution.unknowns, self.max_iterations, self.deadline)
+            begin = solution.unknowns if np.isfinite(solution.unknowns).all() else straight
+            solution = interior_point(program, begin, self.max_iterations, self.deadline)
         if solution.success:
             return program.trajectory(solution.unknowns)
         raise PlanningError(_explanation(self.task, rows, solution, self.time_limit))

@@ -6,7 +6,6 @@ import ctypes
 import os
 import time
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from itertools import pairwise
@@ -29,8 +28,8 @@ LANES = 8
 _PATIENCE = 0.2
 """Longest time, s, for which signals are not noticed, where the work can be interrupted."""
 
-_WORTH_THREADS = 3e-4
-"""Time, s, that a loop takes at least if it is shared among threads."""
+_MOMENT = 3e-4
+"""Time, s, after which a loop is shared among threads: to wake them takes a third of it."""
 
 LLVM: TypeAlias = Any
 """An object of llvmlite, which has no type annotations."""
@@ -231,7 +230,7 @@ def default_threads() -> int:
 
 
 def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: int, threads: int) -> None:
-    """Call a compiled loop for blocks 0 .. n_blocks - 1, on several threads if there are several blocks.
+    """Call a compiled loop for blocks 0 .. n_blocks - 1; what is left after a moment is shared among threads.
 
     The loop is left between two blocks after Ctrl-C, which reaches Python only there.
 
@@ -240,20 +239,18 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
     if threads < 1:
         raise SettingsError(f"threads is {threads}, but at least 1 has to run.")
     loop, stopped = partial(call, *arguments), Event()
-    # The first blocks tell how long the others take: handing these out to threads takes longer than a short loop.
-    begin, timed = time.monotonic(), min(n_blocks, 8, max(1, n_blocks // 16))
-    loop(0, timed)
-    left = (time.monotonic() - begin) * (n_blocks - timed) / max(timed, 1)
-    if threads == 1 or left < _WORTH_THREADS:
-        _run_some(loop, timed, n_blocks, stopped)
+    moment = time.monotonic() + _MOMENT if threads > 1 else np.inf
+    first = _run_some(loop, 0, n_blocks, stopped, moment)
+    if first == n_blocks:
         return
-    from concurrent.futures import wait
+    from concurrent.futures import Future, wait
 
-    parts = deque(pairwise(np.linspace(timed, n_blocks, min(n_blocks - timed, threads * 4) + 1).astype(int).tolist()))
-    work = partial(_run_parts, loop, parts, stopped)
-    others = [_pool(os.getpid(), threads - 1).submit(work) for _ in range(min(threads, len(parts)) - 1)]
+    edges = np.linspace(first, n_blocks, min(n_blocks - first, threads * 4) + 1).astype(int).tolist()
+    parts, others = deque(pairwise(edges)), list[Future[None]]()
     try:
-        work()
+        for _ in range(min(threads, len(parts)) - 1):
+            others.append(_pool(os.getpid(), threads - 1).submit(_run_parts, loop, parts, stopped))
+        _run_parts(loop, parts, stopped)
         for other in others:
             if not other.cancel():  # it has begun
                 other.result()
@@ -264,20 +261,26 @@ def run_blocks(call: Callable[..., None], arguments: Sequence[Any], n_blocks: in
 
 def _run_parts(loop: Callable[[int, int], None], parts: deque[tuple[int, int]], stopped: Event) -> None:
     """Take parts of a loop and run them until none is left."""
-    with suppress(IndexError):
-        while True:
-            _run_some(loop, *parts.popleft(), stopped)
+    while True:
+        try:
+            first, end = parts.popleft()
+        except IndexError:
+            return
+        _run_some(loop, first, end, stopped)
 
 
-def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event) -> None:
-    """Call a loop for blocks first .. end - 1, a part of a second at a time, until it is stopped."""
-    # Blocks of a loop that are run before their time is known.
-    at_a_time = 8
-    while first < end and not stopped.is_set():
-        begin, last = time.monotonic(), min(first + at_a_time, end)
+def _run_some(loop: Callable[[int, int], None], first: int, end: int, stopped: Event, moment: float = np.inf) -> int:
+    """First of the blocks first .. end - 1 that is left when a loop has run until it is stopped or some moment.
+
+    It is called for some blocks at a time, for a part of a second at most.
+    """
+    at_a_time = max(1, min(8, (end - first) // 16))
+    while first < end and not stopped.is_set() and (begin := time.monotonic()) < moment:
+        last = min(first + at_a_time, end)
         loop(first, last)
         first = last
         at_a_time = 2 * at_a_time if time.monotonic() - begin < 0.5 * _PATIENCE else at_a_time
+    return first
 
 
 @lru_cache(maxsize=4)

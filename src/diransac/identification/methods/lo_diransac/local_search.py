@@ -167,7 +167,7 @@ class LocalSearch:
         flexible = self._accurate(self._from_hypothesis(intervals))
         yield self._shown(flexible, 0.35)
         if rival is not None and (ended := self._ended_by(rival, flexible)) is not None:
-            yield ended
+            yield self._shown(ended, 0.6)
             return
         best = self._accurate(self._simplest(flexible))
         yield self._shown(best, 0.6)
@@ -190,14 +190,14 @@ class LocalSearch:
         intervals, own = replace(rival.intervals, hold=flexible.intervals.hold), rival.refinement.fit
         try:
             _, begin = split(flexible.intervals, flexible.refinement.fit, parts)
-            found = self._optimised(rival, intervals, with_residuals(intervals, begin))
+            found = self._accurate(self._optimised(rival, intervals, with_residuals(intervals, begin)))
+            if found.cost > rival.cost + AS_LIKELY:
+                return rival
+            n, estimate = intervals.n_p, fitted_parameters(rival.intervals, own)
         except np.linalg.LinAlgError:
             return None
-        if found.cost > rival.cost + AS_LIKELY:
-            return rival
-        n, estimate = intervals.n_p, fitted_parameters(rival.intervals, own)
         errors, moved = np.sqrt(np.diag(estimate.covariance)), found.refinement.fit.shared[:n] - own.shared[:n]
-        return min(rival, found, key=lambda x: x.cost) if (np.abs(moved) < errors).all() else None
+        return min(rival, found, key=lambda x: x.cost) if (np.abs(moved) <= errors).all() else None
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""

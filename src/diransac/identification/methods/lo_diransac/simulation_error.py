@@ -77,7 +77,7 @@ def simulation_error_candidates(
         Parameters to start from, within the bounds; further ones are random about them.
     actings : sequence of ActingInputs
         Starts are compared with the first; the others follow from its result.  Over short segments the likeliest is
-        taken, and the others follow again over the longest ones.
+        taken; the others follow again over the longest ones, and count unless samples are much less likely with them.
     seed : int
     blocks : Blocks
     outliers : bool, optional
@@ -97,7 +97,8 @@ def simulation_error_candidates(
         chain.append(chain[-1].grown(length).descended())
     last, taken = chain[-1], chain[-1].segments.acting
     others = [last.with_inputs(x).descended(rival=last.cost) for x in actings if x is not taken]
-    return [(x.candidate(blocks), x.simulated) for x in (*chain[1:], *others)]
+    found = [*chain[1:], *(x for x in others if x.cost < x.hopeless(last.cost))]
+    return [(x.candidate(blocks), x.simulated) for x in found]
 
 
 def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
@@ -308,6 +309,10 @@ class _Solution:
         following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
         return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
+    def hopeless(self, rival: float) -> float:
+        """Cost from which on the samples are clearly less likely than a rival leaves them."""
+        return rival + _HOPELESS * np.count_nonzero(self._known)
+
     def likelier(self, other: _Solution) -> _Solution:
         """The likelier of this solution and another one, which descends as long as it may become so."""
         found = other.descended(rival=self.cost)
@@ -318,7 +323,7 @@ class _Solution:
 
         They end where as much gain in all others would leave the samples clearly less likely than a rival does.
         """
-        now, damping, hopeless = self, _DAMPING, rival + _HOPELESS * np.count_nonzero(self._known)
+        now, damping, hopeless = self, _DAMPING, self.hopeless(rival)
         for left in reversed(range(steps)):
             check_time()
             cost = now.cost
