@@ -179,6 +179,10 @@ def test_errors_of_other_orders_of_magnitude_are_told_apart(tmp_path: Path):
     axes = panel(plot_study(tmp_path / "e.db"), "x")
     low, high, of_quick, of_ols = axes.transData.transform([(0, y) for y in (*axes.get_ylim(), 0.01, 90.0)])[:, 1]
     assert 0.02 < (of_quick - low) / (high - low) < 0.5 < (of_ols - low) / (high - low) < 1.0
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert "0" in labels
+    assert {"0.1", "1", "10"} & set(labels)
+    assert not [text for text in labels if "$" in text]  # figures are written without formulas
 
 
 def test_a_median_above_every_mean_is_within_its_panel(tmp_path: Path):

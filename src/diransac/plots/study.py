@@ -204,17 +204,17 @@ def _scale(axes: Axes, mean: FloatArray, highest: FloatArray, logarithmic: bool)
     if not largest > 0.0:
         axes.set_ylim(-0.04, 1.0)
         return
-    # 0.01, 5×10⁻⁵, 10⁶
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: number(y, 6).removeprefix("1×")))
-    if not logarithmic:
+    if logarithmic:
+        first = int(np.floor(np.log10(largest))) - 3
+        axes.set_yscale("symlog", linthresh=10.0**first, linscale=0.5)
+        decades = 10.0 ** np.arange(first, np.floor(np.log10(top)) + 1)
+        axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_ylim(-0.35 * 10.0**first, 1.6 * top)
+    else:
         axes.set_ylim(-0.04 * top, 1.06 * top)
-        return
-    first = int(np.floor(np.log10(largest))) - 3
-    axes.set_yscale("symlog", linthresh=10.0**first, linscale=0.5)
-    decades = 10.0 ** np.arange(first, np.floor(np.log10(top)) + 1)
-    axes.yaxis.set_major_locator(FixedLocator([0.0, *decades]))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_ylim(-0.35 * 10.0**first, 1.6 * top)
+    # 0.01, 5×10⁻⁵, 10⁶; a scale brings a format of its own.
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: number(y, 6).removeprefix("1×")))
 
 
 # Labels and styles ---------------------------------------------------------------------------------------------------
