@@ -42,11 +42,6 @@ class Instruction:
         """Number that a CONST stands for."""
         return float(struct.unpack("<d", self.constant)[0])
 
-    @property
-    def is_zero(self) -> bool:
-        """True for the constant zero."""
-        return self.operation == "CONST" and self.value == 0.0
-
 
 @dataclass(frozen=True)
 class Graph:

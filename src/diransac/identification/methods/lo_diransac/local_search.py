@@ -179,7 +179,7 @@ class LocalSearch:
             yield self._shown(found, 0.6 + 0.03 * k)
 
     def _ended_by(self, rival: Explanation, flexible: Explanation) -> Explanation | None:
-        """What ends a search beside a rival; None where it may find another explanation as likely.
+        """Outcome that ends a search beside a rival; None where it may find another explanation as likely.
 
         A fit with the rival's freedom, where this is not exact and its intervals are parts of these, tells: the rival
         stays where that is less likely, and the likelier of both where their parameters agree.
