@@ -16,8 +16,9 @@ One judge for all, which shares no code with the package: held-out logs are pred
 (0.1, 0.25 and 0.5 s for the pendulums, whose swing-ups are chaotic) from windows that start at smoothed states, with
 the delay, the lag and the hold that a result states.  The score is the root mean square over horizons and signals of
 the robust RMSE (the worst 5 % of windows left out) in the signal's standard deviation over all logs.  The Silverbox is
-judged by the RMSE of a simulation from rest, mV; the Crazyflie by the accelerometer in flight; the legs in MuJoCo.  A
-refusal has the score of no model: positions that stay.
+judged by the RMSE of a simulation from rest, mV; the Crazyflie by the accelerometer in flight; the legs in MuJoCo; the
+arm by the torques of two held-out runs, %; the tanks by one simulation of the validation record, V.  A refusal has the
+score of no model: positions that stay.
 
 Rows that were measured before are judged again and joined: ``--methods default --compare rows.jsonl`` runs the default
 alone beside the methods of that file.  ``--table FILE`` writes the tables as Markdown.
@@ -34,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from real_further import RECORDS as FURTHER
 from real_records import RECORDS as MACHINES
 from real_records import Found, Record
 from real_robots import RECORDS as ROBOTS
@@ -56,7 +58,7 @@ of 95 % are in brackets, structural ones in braces.
 {}
 """
 Row = dict[str, Any]
-RECORDS = {**MACHINES, **ROBOTS}
+RECORDS = {**MACHINES, **ROBOTS, **FURTHER}
 
 
 # ---------------------------------------------------------------------- rows

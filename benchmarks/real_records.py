@@ -11,6 +11,8 @@
 | crazyflie | log15 | log16 |
 | crazyflie-log15 | first half of log15 | second half |
 | go2-FL, go2-FR, go2-RL, go2-RR | first half | second half |
+| arm | a Fourier series of 50 s | another one of 30 s, and ten points |
+| tanks, tanks-k5 | the estimation record | the validation record |
 | px4 | all of it | nothing: no method should answer |
 
 The splits are fixed.  The single run is the first that the row before holds out.
