@@ -35,7 +35,7 @@ from real import DATA, RECORDS, Record, logs_of, scores_of
 from regime_flights import REGIMES, recordings
 
 import diransac as dr
-from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
+from diransac.identification.methods.lo_diransac.forward import Forward, Prediction
 from diransac.identification.methods.lo_diransac.sources import Candidate
 from diransac.study import trial_data
 from simulated import MACHINES, as_log, flight
@@ -70,18 +70,9 @@ def _without_source(name: str) -> Part:
     return Part(replace(DEFAULT, sources=tuple(x for x in DEFAULT.sources if x != name)))
 
 
-_COMPARED = Comparison.of
-
-
-def _alone(scores: Sequence[Any]) -> Any:
-    """The comparison in which the winner has all the weight."""
-    found = _COMPARED(scores)
-    return replace(found, weights=np.where(np.arange(len(found.weights)) == found.best, 1.0, 0.0))
-
-
-def _with_outliers_of_the_fit(arbiter: Arbiter, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
-    """Scores of all samples but those that a fit takes for outliers."""
-    fair = replace(arbiter, lost=arbiter.outliers_of_fit)
+def _with_outliers_of_the_fit(forward: Forward, candidates: Sequence[Candidate]) -> tuple[Forward, list[Prediction]]:
+    """Predictions of all samples but those that a fit takes for outliers."""
+    fair = replace(forward, lost=forward.outliers_of_fit)
     return fair, [fair.scores(x) for x in candidates]
 
 
@@ -107,8 +98,9 @@ def _parts() -> dict[str, Part]:
         "simulation error": _without_source("simulation error"),
         "second fit": Part(patches=(("competition.Contest.is_challenged", lambda *_: False),)),
         "competition": Part(replace(DEFAULT, sources=())),
-        "outliers by predictions": Part(patches=(("arbiter.Arbiter.compared", _with_outliers_of_the_fit),)),
-        "mean of as good estimates": Part(patches=(("competition.Comparison.of", _alone),)),
+        "outliers by predictions": Part(patches=(("forward.Forward.compared", _with_outliers_of_the_fit),)),
+        "prediction of forces": Part(patches=(("judge._EXPLAINED", 0.0),)),
+        "prediction of whole logs": Part(patches=(("forward._LONGEST", 0),)),
         "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
         "second-order correction of steps": Part(patches=(("gauss_newton._CORRECTED", 0.0),)),
         "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),

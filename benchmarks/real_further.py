@@ -75,8 +75,8 @@ def _geometric(values: Array) -> float:
 
 # ---------------------------------------------------------------------- two tanks
 
-SUBSTEPS, EMPTY = 8, 1e-3
-"""Of the simulation, a sample; level under a square root at least, V."""
+SUBSTEPS, EMPTY, STEP = 1, 1e-3, 1e-6
+"""Of the simulation, a sample; level under a square root at least, V; step of derivatives."""
 TANKS = {"k1": 0.1, "k2": 0.05, "k3": 0.05, "k4": 0.1, "k5": 0.0}
 """Round numbers."""
 
@@ -106,7 +106,7 @@ def tanks(data: Path, with_inflow: bool) -> Record:
         highest = 10.0 * max(p[3] / p[0], 1e-6) ** 2
 
         def error(root: float) -> float:
-            return _rms(_levels(p, root**2 * highest, held, inputs) - held["h2"])
+            return _rms(_levels(p[:, None], np.array([root**2 * highest]), held, inputs)[:, 0] - held["h2"])
 
         first = min(np.linspace(0.05, 2.0, 9), key=error)
         found = minimize_scalar(error, bounds=(max(first - 0.25, 0.0), first + 0.25), method="bounded")
@@ -117,14 +117,20 @@ def tanks(data: Path, with_inflow: bool) -> Record:
         rng, size = np.random.default_rng(0), np.array(list(TANKS.values()))
 
         def parameters(z: Array) -> Array:
-            return np.append(size[:4] * np.exp(z[:4]), z[5] if with_inflow else 0.0)
+            """Parameters ``(5, L)`` of ``(L, 6)``."""
+            return np.vstack([size[:4, None] * np.exp(z.T[:4]), z.T[5:] * with_inflow])
 
         def errors(z: Array) -> Array:
-            return _levels(parameters(z), float(np.exp(z[4])), train, Inputs("linear")) - train["h2"]
+            lanes = np.atleast_2d(z)
+            found = _levels(parameters(lanes), np.exp(lanes[:, 4]), train, Inputs("linear")) - train["h2"][:, None]
+            return found.T.reshape(*z.shape[:-1], -1)
+
+        def slopes(z: Array) -> Array:
+            return ((errors(z + STEP * np.eye(len(z))) - errors(z)) / STEP).T
 
         starts = np.column_stack([rng.uniform(-1.0, 1.0, (STARTS, 4)), np.full(STARTS, np.log(5.0)), np.zeros(STARTS)])
-        fits = [least_squares(errors, z, loss="soft_l1", f_scale=0.3, max_nfev=60) for z in starts]
-        best = parameters(min(fits, key=lambda fit: fit.cost).x)
+        fits = [least_squares(errors, z, slopes, loss="soft_l1", f_scale=0.3, max_nfev=30) for z in starts]
+        best = parameters(min(fits, key=lambda fit: fit.cost).x[None])[:, 0]
         return dict(zip(names, best.tolist(), strict=False)), Inputs("linear")
 
     still = _rms(held["h2"] - float(np.median(train["h2"])))
@@ -132,16 +138,17 @@ def tanks(data: Path, with_inflow: bool) -> Record:
     return Record(name, model, [train], judge, Score(still, {}), "V", baselines={"output error": output_error})
 
 
-def _levels(p: Array, upper: float, log: dr.Log, inputs: Inputs) -> Array:
-    """Lower level ``(K,)`` of a simulation from an upper level and the first lower one, by RK4."""
+def _levels(p: Array, upper: Array, log: dr.Log, inputs: Inputs) -> Array:
+    """Lower level ``(K, L)`` of simulations from upper levels ``(L,)`` and the first lower one, by RK4; p is (5, L)."""
     stages = inputs.between(log["pump"][:, None], log.dt, SUBSTEPS)[:, :, 0]
-    h, x, found = log.dt / SUBSTEPS, np.array([upper, log["h2"][0]]), np.empty(len(log))
+    h, found = log.dt / SUBSTEPS, np.empty((len(log), len(upper)))
     k1, k2, k3, k4, k5 = p
 
     def rates(x: Array, u: float) -> Array:
         a, b = np.sqrt(np.maximum(x, EMPTY))
-        return np.array([k4 * u + k5 - k1 * a, k2 * a - k3 * b])
+        return np.stack([k4 * u + k5 - k1 * a, k2 * a - k3 * b])
 
+    x = np.stack([upper, np.full(len(upper), log["h2"][0])])
     found[0] = x[1]
     for k, u in enumerate(stages):
         for i in range(0, 2 * SUBSTEPS, 2):

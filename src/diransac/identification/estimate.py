@@ -26,10 +26,10 @@ class Competitor:
     name : str
         Source and variant.
     errors : tuple of float
-        Root mean square error of the predicted samples at each horizon, over that of the prediction that nothing
-        changes.
+        Root mean square error of the predicted samples at each horizon, over that of the better trivial prediction:
+        that nothing changes, or the median.
     score : float
-        Mean loss of the predictions of held-out blocks; lower is better.
+        Geometric mean of the losses of held-out blocks, of predicted motion and of predicted forces; lower is better.
     as_good : bool
         Whether it predicts as well as the best, within the noise of the comparison.
     parameters : mapping of str to float
@@ -44,7 +44,7 @@ class Competitor:
 
 
 def predicts(errors: Sequence[float] | FloatArray) -> bool:
-    """True if an error at one of the horizons is less than half of that of the prediction that nothing changes."""
+    """True if an error at one of the horizons is less than half of that of a trivial prediction."""
     return bool(np.min(errors) < 0.5)
 
 
@@ -60,8 +60,7 @@ class Competition:
     Parameters
     ----------
     winner : str
-        Name of the estimate that predicts best; no two have the same.  The result is its mean with those that predict
-        as well.
+        Name of the estimate that predicts best, whose parameters are the result; no two have the same.
     horizons : tuple of float
         Horizons of the predictions, s.
     competitors : tuple of Competitor

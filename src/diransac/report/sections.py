@@ -304,7 +304,7 @@ def competitions(entries: Sequence[Entry]) -> list[Table]:
     """Comparison of estimates by held-out prediction of each result that has one."""
     caption = (
         "Estimates compared by open-loop prediction of parts of the logs that they were not estimated from: error over "
-        "that of the prediction that nothing changes"
+        "that of a trivial prediction: that nothing changes, or the median"
     )
     having = [(entry, entry.result.competition.lines()) for entry in entries if entry.result.competition is not None]
     return [Table(lines[0], lines[1:], f"{caption}{_by(entry, entries)}") for entry, lines in having]

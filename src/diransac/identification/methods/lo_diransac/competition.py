@@ -1,4 +1,4 @@
-"""Competition of estimates: sources propose them, and the arbiter compares their predictions.
+"""Competition of estimates: sources propose them, and the judge compares their predictions.
 
 Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
 joint fit compete with least squares of all rows and with simulation error.  Where one of these beats or contradicts the
@@ -18,8 +18,8 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor, predicts
 from diransac.identification.method import report, within
-from diransac.identification.methods.lo_diransac.arbiter import Arbiter, Comparison, Scores
 from diransac.identification.methods.lo_diransac.interval_effects import effect_of_intervals
+from diransac.identification.methods.lo_diransac.judge import Comparison, Judge, Scores
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.projection import (
@@ -167,7 +167,7 @@ class _Entry(NamedTuple):
 class _Judgement(NamedTuple):
     """Scores of all candidates, in their order, and their comparison."""
 
-    arbiter: Arbiter
+    judge: Judge
     scores: list[Scores]
     comparison: Comparison
 
@@ -295,7 +295,7 @@ class Contest:
         winner, origin = self.entries[judged.comparison.best]
         of_fit = not isinstance(origin, Motion)
         result = self._result(judged, search.likeliest)
-        n_rows = judged.arbiter.steps[int(np.argmin(judged.scores[judged.comparison.best].errors))]
+        n_rows = judged.judge.steps[int(np.argmin(judged.scores[judged.comparison.best].errors))]
         answer = replace(winner, parameters=result.parameters)
         outcome = Decided(self._summary(judged), None if of_fit else winner.acting, answer, n_rows)
         impossible = search.impossible if of_fit else ()
@@ -313,7 +313,7 @@ class Contest:
 
         def errors(p: FloatArray) -> FloatArray:
             everywhere = np.repeat(p[None], self.blocks.n, axis=0)
-            return judged.arbiter.scores(replace(one, parameters=p, without=everywhere)).errors
+            return judged.judge.scores(replace(one, parameters=p, without=everywhere)).errors
 
         with suppress(TimeLimitError, np.linalg.LinAlgError):  # what was decided stays
             others = equivalents_of(self.dataset, self.intervals, parameters) + others
@@ -348,13 +348,13 @@ class Contest:
         report(self.callback, "comparing predictions", 0.89)
         inlying, noise = self._noise_of(search)
         acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
-        arbiter = Arbiter.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
-        if arbiter is None:
+        judge = Judge.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
+        if judge is None:
             return None
-        arbiter, scores = arbiter.compared(self.candidates)
+        judge, scores = judge.compared(self.candidates)
         if not any(np.isfinite(x.losses).any() for x in scores):
             return None
-        judged = _Judgement(arbiter, scores, Comparison.of(scores))
+        judged = _Judgement(judge, scores, Comparison.of(scores))
         best = judged.comparison.best
         winner = self.candidates[best]
         errors = ", ".join(f"{x:.2g}" for x in scores[best].errors)
@@ -374,26 +374,15 @@ class Contest:
         return inlying | ~own.known, np.maximum(noise, floor)
 
     def _result(self, judged: _Judgement, fit_of: Explanation) -> ProjectedEstimate:
-        """Mean of the winner and of those that predict as well, and a covariance that covers them.
-
-        Those whose inputs act at another time than the winner's count in the covariance alone.  Where their mean
-        predicts clearly worse than the winner, its own parameters stay.
-        """
+        """The winner, with a covariance that covers those that predict as well."""
         best, weights = judged.comparison.best, judged.comparison.weights
         one = self.candidates[best]
-        alike = weights * np.array([x.acting.timing == one.acting.timing for x in self.candidates])
-        share = alike / alike.sum()
         parameters = np.array([x.parameters for x in self.candidates])
-        mean = replace(
-            one, parameters=share @ parameters, without=np.tensordot(share, [x.without for x in self.candidates], 1)
-        )
-        alone = Comparison.of([judged.scores[best], judged.arbiter.scores(mean)])
-        centre = mean.parameters if alone.as_good[1] else one.parameters
-        apart = parameters - centre
+        apart = np.where(weights[:, None] > 0.0, parameters - one.parameters, 0.0)
         spread = (weights * apart.T) @ apart / weights.sum()
         found = one.estimate() if one.estimate is not None else self._of_blocks(one, fit_of)
         found = replace(found, covariance=found.covariance + spread)
-        return with_parameters(fit_of.intervals, fit_of.refinement.fit, found, centre)
+        return with_parameters(fit_of.intervals, fit_of.refinement.fit, found, one.parameters)
 
     def _of_blocks(self, one: Candidate, fit_of: Explanation) -> ProjectedEstimate:
         """An estimate that no fit gave, with the covariance of the jackknife over blocks."""
@@ -418,7 +407,7 @@ class Contest:
             )
             for one, x, loss, as_good in rows
         )  # fmt: skip
-        return Competition(self.candidates[c.best].name, judged.arbiter.horizons, competitors)
+        return Competition(self.candidates[c.best].name, judged.judge.horizons, competitors)
 
 
 def _estimates_of_fit(

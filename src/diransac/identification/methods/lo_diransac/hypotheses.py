@@ -309,19 +309,16 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
     """
     model, H, layout = intervals.model, intervals.length, intervals.layout
     n_p = model.n_p
-    bump = np.sin(np.pi * (np.arange(H) + 0.5) / H) ** 2
-    bump /= bump.sum()
+    bump = bump_of(H)
     Ws, bs = [], []
     for i, rows in enumerate(intervals.rows_of_logs):
+        firsts = firsts_of(intervals, rows) - rows.start
+        if not len(firsts):
+            continue
         logged = slice(rows.start, rows.start + int(intervals.is_logged[rows].sum()))
         q, v, a, y = motion.parts(model, logged)
         W, b = regression_rows(model, q, v, a, intervals.inputs[logged], y)
         r = b.shape[1]
-        firsts = np.arange(0, len(b) - H + 1, max(1, H // _OVERLAP))
-        gaps = np.concatenate([[0], np.cumsum(intervals.gaps[logged])])
-        firsts = firsts[gaps[firsts + H] == gaps[firsts]]
-        if not len(firsts):
-            continue
         both = np.concatenate([W.swapaxes(1, 2).reshape(len(b), -1), b], axis=1)
         del q, v, a, y, W
         windows = np.lib.stride_tricks.sliding_window_view(both, H, axis=0)
@@ -330,6 +327,32 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         Ws.append(layout.scattered(means[:, : n_p * r].reshape(-1, n_p, r).swapaxes(1, 2), i))
         bs.append(means[:, n_p * r :])
     return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
+
+
+def bump_of(n_rows: int) -> FloatArray:
+    """Weights ``(n_rows,)`` of the rows of an average, which vanish towards its ends; their sum is 1.
+
+    Parameters
+    ----------
+    n_rows : int
+    """
+    bump = np.sin(np.pi * (np.arange(n_rows) + 0.5) / n_rows) ** 2
+    return np.asarray(bump / bump.sum())
+
+
+def firsts_of(intervals: ShootingIntervals, rows: slice) -> IntArray:
+    """First rows of overlapping averages of an interval's length, within one log and outside of its gaps.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    rows : slice
+        Those of the log.
+    """
+    H, n_logged = intervals.length, int(intervals.is_logged[rows].sum())
+    firsts = np.arange(0, n_logged - H + 1, max(1, H // _OVERLAP))
+    gaps = np.concatenate([[0], np.cumsum(intervals.gaps[rows][:n_logged])])
+    return np.asarray(rows.start + firsts[gaps[firsts + H] == gaps[firsts]])
 
 
 def _scaled(weak: WeakForm, n_v: int) -> WeakForm:

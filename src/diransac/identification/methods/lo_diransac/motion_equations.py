@@ -97,6 +97,19 @@ def equations_of_rows(
     return a, regressors_of_rows(model, q, v, a, u, p)
 
 
+def residuals_of_rows(
+    model: Model, q: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, p: FloatArray
+) -> FloatArray:
+    """Residuals ``(N, n_v)`` of the model in every row, with any accelerations.
+
+    Parameters
+    ----------
+    model : Model
+    q, v, a, u, p : (N, n) array
+    """
+    return np.asarray(_residual_map(model)(q, v, a, u, p)[0])
+
+
 def regressors_of_rows(
     model: Model, q: FloatArray, v: FloatArray, a: FloatArray, u: FloatArray, p: FloatArray
 ) -> FloatArray:

@@ -262,6 +262,18 @@ def stretches(intervals: ShootingIntervals) -> list[slice]:
     return [slice(a, b + 1) for a, b in zip(np.flatnonzero(begins), np.flatnonzero(ends), strict=True)]
 
 
+def whole_stretches(intervals: ShootingIntervals) -> list[slice]:
+    """Stretches that are at least half as long as the longest: whole logs, but for pieces between gaps.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    """
+    parts = stretches(intervals)
+    longest = max((x.stop - x.start for x in parts), default=0)
+    return [x for x in parts if 2 * (x.stop - x.start) >= longest]
+
+
 def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
     """Mask ``(N, n_signals)`` of the samples that are not far from a smoothed motion, in units of what it leaves.
 

@@ -1,7 +1,8 @@
 """Simulation error (output error): parameters and initial states of segments, fitted to the samples together.
 
 It neither smooths nor differentiates.  Short segments have few local minima, long ones the information: a search from
-many starts over the shortest segments is followed by fits over segments three times as long, up to a block.
+many starts over the shortest segments is followed by fits over segments three times as long, up to a block, and on to a
+whole log as far as it can be simulated at once.
 
 Initial states have a Gaussian prior, the measured or smoothed state within the spread of the motion: few samples of a
 segment may not determine them.  Samples are a mixture with outliers, and so are those of a segment that diverges.
@@ -13,7 +14,7 @@ Ljung 1999, section 5.1 (output error); Ribeiro et al. 2020 (segments that grow)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING
@@ -29,6 +30,7 @@ from diransac.identification.methods.lo_diransac.segments import (
     inlying_samples,
     prior_states,
     stretches,
+    whole_stretches,
 )
 from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate, jackknife
 from diransac.time_limit import check_time
@@ -50,6 +52,8 @@ _WHOLE_ROW = 1.0 / 12.0
 _STEPS, _FEW_STEPS, _CONVERGED, _NOISE_MOVES = 25, 3, 0.1, 0.03
 """Steps at most, and of a solution that is close to another; change of parameters, standard errors, and relative change
 of the noise that end them."""
+_SIMULATED = 0.5
+"""Robust scale of the errors over the spread of a signal, up to which a simulation follows it."""
 _HOPELESS = 0.1
 """Loss of log-likelihood per sample, of errors a tenth larger, from which on a solution is not followed to its end."""
 _DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
@@ -86,7 +90,7 @@ def simulation_error_candidates(
     Returns
     -------
     list of (Candidate, Motion)
-        The shortest segments first; empty where the logs are too short.
+        The longest segments, which inform most, first; empty where the logs are too short.
     """
     starts, lengths = np.vstack([starts, _random_starts(intervals, starts, seed)]), _lengths(intervals, blocks)
     first = _from_starts(intervals, motion, starts, actings[0], lengths[0], outliers=outliers)
@@ -95,10 +99,15 @@ def simulation_error_candidates(
     chain = [reduce(_Solution.likelier, (first.with_inputs(x) for x in actings[1:]), first)]
     for length in lengths:
         chain.append(chain[-1].grown(length).descended())
+    for length in _whole_lengths(intervals, lengths[-1]):
+        longer = chain[-1].grown(length)
+        if not longer.is_simulated:
+            break
+        chain.append(longer.descended())
     last, taken = chain[-1], chain[-1].segments.acting
     others = [last.with_inputs(x).descended(rival=last.cost) for x in actings if x is not taken]
-    found = [*chain[1:], *(x for x in others if x.cost < x.hopeless(last.cost))]
-    return [(x.candidate(blocks), x.simulated) for x in found]
+    found = [*(x for x in others if x.cost < x.hopeless(last.cost)), *chain[1:]]
+    return [(x.candidate(blocks), x.simulated) for x in reversed(found)]
 
 
 def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
@@ -107,6 +116,12 @@ def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
     longest = int(np.clip(block, 1, max((int(x.stop - x.start) for x in stretches(intervals)), default=1)))
     n = max(0, int(np.log(longest / _SHORTEST) / np.log(_GROWTH)))
     return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
+
+
+def _whole_lengths(intervals: ShootingIntervals, block: int) -> list[int]:
+    """Rows of longer segments than a block: three times as many, and those of whole logs."""
+    whole = min((x.stop - x.start for x in whole_stretches(intervals)), default=0)
+    return [x for x in (_GROWTH * block, whole) if block < x <= min(whole, _MOST_ROWS)]
 
 
 def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: bool = True) -> list[LogEstimate]:
@@ -278,8 +293,12 @@ class _Solution:
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
+        return self._equations_of(np.ones(len(self.segments.intervals.measured), bool))
+
+    def _equations_of(self, rows: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """The same with samples in some rows (N,) alone."""
         segments, n_x = self.segments, self.states.shape[1]
-        weights = segments.weights(self._losses_and_inlying[1] / np.square(self.noise.sigma))
+        weights = segments.weights(self._losses_and_inlying[1] / np.square(self.noise.sigma)) * rows[:, None]
         sums = segments.gauss_newton(*_lanes(segments, self.parameters, self.states), weights)
         H, g = sums.normal_matrix, sums.gradient
         if not segments.intervals.layout.is_shared:
@@ -298,16 +317,8 @@ class _Solution:
         return matrix, gradient
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
-
-        After a step dp of the parameters, these change by ``-following (dp, 1)``, with ``following (K, n_x, n + 1)``.
-        """
-        (H, g), n_x = self._equations, self.states.shape[1]
-        d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
-        scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
-        right = np.concatenate([H[:, :, n_x:], g[:, :, None]], axis=2)
-        following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
-        return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
+        """Equations of the parameters without the states, as `_eliminated`."""
+        return _eliminated(*self._equations, self.states.shape[1], damping)
 
     def hopeless(self, rival: float) -> float:
         """Cost from which on the samples are clearly less likely than a rival leaves them."""
@@ -361,20 +372,36 @@ class _Solution:
         scale = np.nan_to_num(lower_scale(found.errors, found._known), nan=1.0)
         return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
 
+    @property
+    def is_simulated(self) -> bool:
+        """True if the errors are clearly less than the spread of their signals: the simulation is not lost."""
+        spread = self.motion.spread[self.segments.columns]
+        return bool((self.noise.sigma < _SIMULATED * spread).all())
+
     def with_inputs(self, acting: ActingInputs) -> _Solution:
         """The solution with inputs that act otherwise, at the same parameters and states."""
         return self._at(replace(self.segments, acting=acting), self.parameters, self.states)
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
-        segments, intervals = self.segments, self.segments.intervals
-        block = blocks.of_row[segments.starts + segments.n_rows // 2]
-        parts, without = self._reduced(0.0)[0], []
-        for k in range(blocks.n):
-            step = -_solved(*_with_priors(intervals, self.parameters, parts[block != k]), 0.0)
+        segments, intervals, without = self.segments, self.segments.intervals, []
+        for parts in self._parts_without(blocks):
+            step = -_solved(*_with_priors(intervals, self.parameters, parts), 0.0)
             without.append(_moved(intervals, self.parameters, step))
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
         return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
+
+    def _parts_without(self, blocks: Blocks) -> Iterator[FloatArray]:
+        """Equations ``(K, n, n + 1)`` without each block: without its segments, or without its rows of longer ones."""
+        of_row, segments = blocks.of_row, self.segments
+        longer = segments.n_rows > np.bincount(of_row, minlength=blocks.n).min()
+        block, parts = of_row[segments.starts + segments.n_rows // 2], None if longer else self._reduced(0.0)[0]
+        for k in range(blocks.n):
+            yield parts[block != k] if parts is not None else self._parts_of(of_row != k)
+
+    def _parts_of(self, rows: BoolArray) -> FloatArray:
+        """Equations of the parameters from samples in some rows (N,) alone."""
+        return _eliminated(*self._equations_of(rows), self.states.shape[1], 0.0)[0]
 
     def standard_errors(self, blocks: Blocks) -> FloatArray:
         """Standard errors ``(n,)`` of the parameters, by the jackknife over blocks; those by white noise at least."""
@@ -416,6 +443,18 @@ class _Solution:
         finite = np.isfinite(series).all(axis=(1, 2))
         signals[self.segments.rows[finite]] = series[finite]
         return replace(self.motion, signals=signals)
+
+
+def _eliminated(H: FloatArray, g: FloatArray, n_x: int, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
+
+    After a step dp of the parameters, these change by ``-following (dp, 1)``, with ``following (K, n_x, n + 1)``.
+    """
+    d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
+    scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
+    right = np.concatenate([H[:, :, n_x:], g[:, :, None]], axis=2)
+    following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
+    return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
 
 
 def _lanes(segments: Segments, parameters: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:

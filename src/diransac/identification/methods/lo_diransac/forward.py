@@ -1,13 +1,9 @@
-"""Comparison of estimates by prediction of blocks of the logs that they were not estimated from.
+"""Open-loop prediction of blocks of the logs by estimates that were not made from them.
 
-Every estimate predicts the same segments, open loop.  The samples at the beginning of a segment determine its initial
-state; the samples after them are predicted, with the parameters as they are without the block.  The error of a signal
-counts in units of its spread, by the logarithm of one plus its square: a segment in which a prediction is lost counts
-little more than one in which it is no better than a constant.
-
-References
-----------
-Shao 1993 (choice by cross-validation); Burman, Chow, Nolan 1994 (blocks of dependent data); Yao et al. 2018 (stacking).
+Every estimate predicts the same segments.  The samples at the beginning of a segment determine its initial state; those
+after it are predicted, with the parameters as they are without the blocks that count.  The error of a signal counts in
+units of its spread, by the logarithm of one plus its square: a segment in which a prediction is lost counts little more
+than one in which it is no better than a constant.
 """
 
 from __future__ import annotations
@@ -22,8 +18,13 @@ from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
-from diransac.identification.methods.lo_diransac.segments import OUTLYING, Segments, prior_states, stretches
-from diransac.identification.regression.uncertainty import student_quantile
+from diransac.identification.methods.lo_diransac.segments import (
+    OUTLYING,
+    Segments,
+    prior_states,
+    stretches,
+    whole_stretches,
+)
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
@@ -41,72 +42,8 @@ _GOOD = 10.0
 """Factor of the least error in a block up to which a candidate is good there."""
 _MOST_ROWS = 100_000
 """Rows that are compared, at most: the errors of all candidates are in memory together."""
-_AS_WELL = 0.02
-"""Difference of the logarithms of losses that does not count."""
-_NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
-"""Loss in comparison with which all are equal: a thousandth of the motion."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Scores:
-    """Predictions of one candidate.
-
-    Parameters
-    ----------
-    errors : (n_horizons,) array
-        Root mean square error of the predicted samples over that of the prediction that nothing changes.
-    losses : (n_horizons, n_blocks) array
-        Mean loss of each block; NaN where it has no segment with a sample.
-    """
-
-    errors: FloatArray
-    losses: FloatArray
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Comparison:
-    """Candidates in comparison, block by block, by the logarithm of their losses: no block decides alone.
-
-    Parameters
-    ----------
-    best : int
-        Index of the winner: the first candidate that the best one does not beat by more than the noise of the
-        comparison, nor by more than a fiftieth of its loss.
-    weights : (n_candidates,) array
-        exp(-z^2 / 4) of the difference from the winner, z in standard errors; 1 for those that predict better.  The
-        difference in another log as long has twice the variance of the mean difference in this one.  That of a winner
-        whose loss is negligible is the only one.
-    as_good : (n_candidates,) bool array
-        Candidates that predict as well, within the noise of the comparison.
-    losses : (n_candidates,) array
-        Mean losses over the blocks and the horizons that count.
-    """
-
-    best: int
-    weights: FloatArray
-    as_good: BoolArray
-    losses: FloatArray
-
-    @classmethod
-    def of(cls, scores: Sequence[Scores]) -> Comparison:
-        """Comparison of candidates.
-
-        Horizons over which no candidate predicts better than that nothing changes do not count: there, an unstable
-        machine is lost, and estimates that respond less to their inputs have the smaller errors.
-        """
-        told = np.fmin.reduce([x.errors for x in scores]) < 1.0
-        told = told if told.any() else np.ones_like(told)
-        losses = _means(np.array([x.losses[told] for x in scores]).swapaxes(1, 2))
-        logs = np.log(losses + _NEGLIGIBLE)
-        first = int(np.nanargmin(_means(logs)))
-        difference, error = _differences(logs, first)
-        quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)
-        best = int(np.flatnonzero(difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING)[0])
-        difference, error = _differences(logs, best)
-        z = np.nan_to_num(np.maximum(difference, 0.0) / (error + _ROUNDING), nan=np.inf)
-        alone = _means(losses[best]) < _NEGLIGIBLE
-        weights = np.where(alone & (np.arange(len(z)) != best), 0.0, np.exp(-0.25 * np.square(z)))
-        return cls(best, weights, np.asarray(z <= quantile), _means(losses))
+_LONGEST = 200_000
+"""Rows of a log that is simulated at once, at most: once for each block."""
 
 
 def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:
@@ -150,8 +87,12 @@ def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after
     return np.concatenate(starts), np.concatenate(left_out)
 
 
+Prediction = tuple[FloatArray, FloatArray]
+"""Errors ``(n_horizons,)`` over those of the better trivial prediction, and losses ``(n_horizons, n_blocks)``."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Arbiter:
+class Forward:
     """Segments of the logs that every candidate predicts.
 
     Parameters
@@ -161,7 +102,8 @@ class Arbiter:
     block : (K,) int array
         Block of the middle of the predicted rows.
     left_out : (K, n_blocks) bool array
-        Blocks of which a segment has rows, without which estimates predict it.
+        Blocks without which estimates predict a segment, and whose rows count in it.
+    blocks : Blocks
     n_before : int
         Rows that determine the initial state of a segment.
     steps : tuple of int
@@ -179,6 +121,7 @@ class Arbiter:
     segments: Segments
     block: IntArray
     left_out: BoolArray
+    blocks: Blocks
     n_before: int
     steps: tuple[int, ...]
     motion: Motion
@@ -196,7 +139,7 @@ class Arbiter:
         noise: FloatArray,
         blocks: Blocks,
         horizon: float | None,
-    ) -> Arbiter | None:
+    ) -> Forward | None:
         """Segments over the blocks; None where the logs are too short, or no predicted sample is known.
 
         ``horizon`` is in s; None: several, from the time scales of the motion.
@@ -209,7 +152,31 @@ class Arbiter:
         starts, block = _placed(intervals, blocks, n_before, steps[-1])
         segments = Segments(intervals, acting, starts, n_before + steps[-1])
         left_out = np.array([(blocks.of_row[segments.rows] == k).any(axis=1) for k in range(blocks.n)]).T
-        found = cls(segments, block, left_out, n_before, tuple(steps), motion, inlying, noise)
+        found = cls(segments, block, left_out, blocks, n_before, tuple(steps), motion, inlying, noise)
+        return found if found._known.any() else None
+
+    @classmethod
+    def of_whole_logs(
+        cls,
+        acting: ActingInputs,
+        intervals: ShootingIntervals,
+        motion: Motion,
+        inlying: BoolArray,
+        noise: FloatArray,
+        blocks: Blocks,
+    ) -> Forward | None:
+        """Each block within one simulation from the beginning of its log, by the estimate without it.
+
+        None where the logs are too short, or too long, or no predicted sample is known.
+        """
+        whole, n_before = whole_stretches(intervals), intervals.length
+        n_rows = min((x.stop - x.start for x in whole), default=0)
+        if not 2 * n_before <= n_rows <= _LONGEST:
+            return None
+        pairs = [(x.start, k) for x in whole for k in np.unique(blocks.of_row[x.start + n_before : x.start + n_rows])]
+        starts, block = np.array(pairs).T
+        segments, left_out = Segments(intervals, acting, starts, n_rows), block[:, None] == np.arange(blocks.n)
+        found = cls(segments, block, left_out, blocks, n_before, (n_rows - n_before,), motion, inlying, noise)
         return found if found._known.any() else None
 
     @property
@@ -241,8 +208,9 @@ class Arbiter:
 
     @cached_property
     def _known(self) -> BoolArray:
-        """Mask ``(n_s, K, n_after)`` of the predicted samples that count."""
-        sampled = self._predicted(self.segments.intervals.sampled)
+        """Mask ``(n_s, K, n_after)`` of the predicted samples that count: of blocks that an estimate is without."""
+        of_row = self.blocks.of_row[self.segments.rows[:, self._after]]
+        sampled = self._predicted(self.segments.intervals.sampled) & np.take_along_axis(self.left_out, of_row, axis=1)
         return sampled if self.lost is None else sampled & ~self.lost
 
     @cached_property
@@ -267,17 +235,17 @@ class Arbiter:
         return size_or_one(_root_mean_squares(flat - _medians(flat)[:, None]))
 
     @cached_property
-    def _no_change(self) -> list[FloatArray]:
-        """RMS errors ``(n_s,)`` of the prediction that nothing changes, by horizon."""
+    def _trivial(self) -> list[FloatArray]:
+        """RMS errors ``(n_s,)`` of the better one of two predictions: nothing changes, and the median; by horizon."""
         one, few, y = self.segments, max(1, min(3, self.n_before)), self._measured
         before, columns = one.rows[:, self.n_before - few : self.n_before], one.columns[self._places]
         measured, seen = one.intervals.measured, one.intervals.sampled & self.inlying
         apart = y - _medians(np.where(seen, measured, np.nan).T[columns][:, before])[:, :, None]
         sizes = [_root_mean_squares(apart[:, :, :n].reshape(len(y), -1)) for n in self._n_rows]
-        return [np.where(size > 0.0, size, self._spread) for size in sizes]
+        return [np.where(size > 0.0, np.fmin(size, self._spread), self._spread) for size in sizes]
 
-    def compared(self, candidates: Sequence[Candidate]) -> tuple[Arbiter, list[Scores]]:
-        """The arbiter without the samples that no good candidate predicts, and its scores of all candidates.
+    def compared(self, candidates: Sequence[Candidate]) -> tuple[Forward, list[Prediction]]:
+        """The predictions without the samples that no good candidate predicts, and its scores of all candidates.
 
         The good candidates of a block are those whose robust errors there are at most ten times the least.  A sample
         is lost if all of them miss it by six times what they leave of the others, and if the fit takes it for an
@@ -289,7 +257,7 @@ class Arbiter:
 
         Returns
         -------
-        Arbiter, list of Scores
+        Forward, list of Prediction
         """
         errors = self._errors(candidates)
         scales = np.array([self._block_scales(x) for x in errors])
@@ -303,29 +271,31 @@ class Arbiter:
             fair, n_lost = replace(self, lost=lost), lost.sum()
         return fair, [fair._scores(x) for x in errors]
 
-    def scores(self, candidate: Candidate) -> Scores:
-        """Predictions of a candidate, each segment by its estimate without the blocks of the segment.
+    def scores(self, candidate: Candidate) -> Prediction:
+        """Errors and losses of a candidate, each segment by its estimate without the blocks that count.
 
         The loss of a signal over a horizon is ``log(1 + mse / spread^2)``.
         """
         return self._scores(self._errors([candidate])[0])
 
-    def _scores(self, errors: FloatArray) -> Scores:
-        """Scores of errors ``(n_s, K, n_after)``."""
+    def _scores(self, errors: FloatArray) -> Prediction:
+        """Errors and losses by horizon, of errors ``(n_s, K, n_after)``."""
         losses, found = list[FloatArray](), list[FloatArray]()
         squares = np.where(self._known, np.square(errors), 0.0)
-        for n, count, size in zip(self._n_rows, self._counts, self._no_change, strict=True):
+        for n, count, size in zip(self._n_rows, self._counts, self._trivial, strict=True):
             mse = np.where(count > 0, squares[:, :, :n].sum(axis=2) / np.maximum(count, 1), np.nan)
             losses.append(np.log1p(np.minimum(mse.T / np.square(self._spread), _LOST)))
             found.append(_medians(mse / np.square(size)[:, None]))
-        by_horizon = _means(np.array(losses))
-        of_blocks = np.array([_means(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
-        return Scores(np.sqrt(_means(np.array(found))), of_blocks)
+        by_horizon = means_of_known(np.array(losses))
+        of_blocks = np.array([means_of_known(by_horizon[:, self.block == k]) for k in range(self.left_out.shape[1])]).T
+        return np.sqrt(means_of_known(np.array(found))), of_blocks
 
     def _block_scales(self, errors: FloatArray) -> FloatArray:
         """Geometric means over the signals of robust scales ``(n_blocks,)`` of errors in each block; NaN if unknown."""
         blocks = [self.block == k for k in range(self.left_out.shape[1])]
-        return np.exp(_means(np.log(np.array([_scale(errors[:, x], self._known[:, x]) for x in blocks]) + _TINY)))
+        return np.exp(
+            means_of_known(np.log(np.array([_scale(errors[:, x], self._known[:, x]) for x in blocks]) + _TINY))
+        )
 
     def _errors(self, candidates: Sequence[Candidate]) -> list[FloatArray]:
         """Errors ``(n_s, K, n_after)`` of the predicted samples, of each candidate."""
@@ -355,7 +325,7 @@ def _scale(errors: FloatArray, known: BoolArray) -> FloatArray:
     return lower_scale(errors.reshape(len(errors), -1).T, known.reshape(len(known), -1).T)
 
 
-def _means(values: FloatArray) -> FloatArray:
+def means_of_known(values: FloatArray) -> FloatArray:
     """Means of the finite numbers along the last axis; NaN where there are none."""
     known = np.isfinite(values)
     count = known.sum(axis=-1)
@@ -372,11 +342,4 @@ def _medians(values: FloatArray) -> FloatArray:
 
 def _root_mean_squares(values: FloatArray) -> FloatArray:
     """Root mean squares of the finite numbers along the last axis; NaN where there are none."""
-    return np.asarray(np.sqrt(_means(np.square(values))))
-
-
-def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:
-    """Mean difference ``(n,)`` of the losses from those of one candidate, and its standard error, by blocks."""
-    apart = scores - scores[reference]
-    n, mean = np.isfinite(apart).sum(axis=1), _means(apart)
-    return mean, np.sqrt(_means(np.square(apart - mean[:, None])) / np.maximum(n - 1, 1))
+    return np.asarray(np.sqrt(means_of_known(np.square(values))))
