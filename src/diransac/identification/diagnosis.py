@@ -91,6 +91,8 @@ class Diagnosis:
         Names of the parameters that the logs do not determine.
     combinations : tuple of str, optional
         Sentences about these parameters: the combinations that are determined, the reason, the remedy.
+    known_up_to : tuple of (tuple of str, str), optional
+        Parameters of which only a combination is determined, and a sentence about each such group.
     suggested_terms : mapping of str to (W,) array, optional
         What suggested terms explain of each unmodelled force, or of each acceleration where there are no forces, beside
         the parameters that would change with them; empty without suggestions.
@@ -110,6 +112,7 @@ class Diagnosis:
     input_delay_significant: bool
     unidentifiable: tuple[str, ...]
     combinations: tuple[str, ...] = ()
+    known_up_to: tuple[tuple[tuple[str, ...], str], ...] = ()
     suggested_terms: Series = field(default_factory=dict)
 
     def __post_init__(self) -> None:

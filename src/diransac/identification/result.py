@@ -358,6 +358,11 @@ class Result:
         return tuple(dict.fromkeys(parameter_of(name, self.model.parameters) for name in found))
 
     @property
+    def known_up_to(self) -> list[tuple[tuple[str, ...], str]]:
+        """Parameters that only a combination of which is determined, with a sentence; they have no intervals alone."""
+        return [] if self.diagnosis is None else list(self.diagnosis.known_up_to)
+
+    @property
     def degrees_of_freedom(self) -> int:
         """Degrees of freedom of the covariance."""
         return self.estimate.degrees_of_freedom

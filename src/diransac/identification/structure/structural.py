@@ -19,6 +19,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, residual_slopes
+from diransac.identification.structure.free_units import KnownUpTo
 from diransac.identification.structure.identifiability import (
     Ambiguity,
     ambiguity_of,
@@ -263,7 +264,8 @@ def unidentifiable(
     measured: tuple[str, ...] | None = None,
     ranges: Ranges | None = None,
     excited: BoolArray | None = None,
-) -> tuple[BoolArray, tuple[str, ...]]:
+    of_units: Sequence[KnownUpTo] = (),
+) -> tuple[BoolArray, tuple[str, ...], tuple[KnownUpTo, ...]]:
     """Parameters of an estimate that are not identifiable, by the equations or from the log.
 
     Parameters
@@ -282,6 +284,8 @@ def unidentifiable(
         As `structural`.
     excited : (n,) bool array, optional
         Parameters about which the motion informs at the estimate; None: it is not known of any.
+    of_units : sequence of KnownUpTo, optional
+        Parameters whose unit is that of a state that nothing measures.
 
     Returns
     -------
@@ -289,13 +293,16 @@ def unidentifiable(
         The uncertain parameters, and those that the equations do not determine.
     sentences : tuple of str
         The names, the combinations that are determined, and what to do.
+    known_up_to : tuple of KnownUpTo
+        Those of these sentences in which a combination is determined, with the names.
     """
-    of_model = structural(model, measured, ranges)
-    ambiguous = {name for x in of_model for name in x.names}
+    of_model = [x for x in structural(model, measured, ranges) if not any(set(x.names) <= set(n) for n, _ in of_units)]
+    ambiguous = {name for x in of_model for name in x.names} | {name for names, _ in of_units for name in names}
     by_equations = np.array([name in ambiguous for name in layout.owners])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)
-    sentences = [x.sentence(x.of_equations()) for x in of_model]
-    sentences += [in_words([x], layout.n_logs) for x in from_log if x.n_determined]
+    known = [*of_units, *((x.names, x.sentence(x.of_equations())) for x in of_model if x.n_determined)]
+    known += [(x.names, in_words([x], layout.n_logs)) for x in from_log if x.n_determined]
+    sentences = [*(text for _, text in known), *(x.sentence(x.of_equations()) for x in of_model if not x.n_determined)]
     alone = [n for x in from_log if not x.n_determined for n in x.names]
     seen = dict(zip(layout.names, np.zeros(len(uncertain), bool) if excited is None else excited, strict=True))
     for is_seen in (False, True):
@@ -303,4 +310,4 @@ def unidentifiable(
         if names:
             x = Ambiguity(names, 0, ())
             sentences.append(x.sentence(x.of_noise() if is_seen else x.of_motion(), of_logs(layout.n_logs)))
-    return uncertain | by_equations, tuple(sentences)
+    return uncertain | by_equations, tuple(sentences), tuple(known)

@@ -40,6 +40,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.equivalents import is_close
+from diransac.identification.structure.free_units import KnownUpTo, known_up_to_units
 from diransac.identification.structure.refusal import check_signs
 from diransac.identification.structure.structural import check_structure, unidentifiable
 from diransac.process import memory_kept
@@ -353,13 +354,17 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
     spans = np.sqrt(np.diag(result.covariance)) * 1.96
     units = parameter_units(intervals, best.motion, result.parameters)
     lost = ~((spans < units) | (spans < np.abs(result.parameters)))
+    lost |= (units == 0.0) & np.isinf(dataset.layout.prior_std)  # a limit that never acts may be anything
     measured = measured_signals(intervals) if unmeasured_states(intervals) else None
-    informed = None
-    if lost.any():
-        informed = excited(dataset.model, dataset.layout, rows_of_logs(intervals, best.motion), result.parameters)
-    lost, combinations = unidentifiable(
-        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges, informed
+    rows, hidden = rows_of_logs(intervals, best.motion), unmeasured_states(intervals)
+    informed = excited(dataset.model, dataset.layout, rows, result.parameters) if lost.any() else None
+    free = known_up_to_units(
+        dataset.model, dataset.layout, rows, result.parameters, hidden, measured_signals(intervals)
     )
+    lost, combinations, known = unidentifiable(
+        dataset.model, dataset.layout, result.parameters, result.covariance, lost, measured, dataset.ranges, informed,
+        free,
+    )  # fmt: skip
     covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf
     nonlinear = bool(dataset.model.nonlinear_parameters)
@@ -374,7 +379,7 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
         stop_reason=end,
         resolution=found.resolution(forced=settings.forces_timing),
         notes=best.notes,
-        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations),
+        diagnosis=_diagnosis(found, tuple(n for n, x in zip(names, lost, strict=True) if x), combinations, known),
         checks=checks,
         suggestions=found.lacks.suggestions if found.lacks else (),
         competition=None if best.decided is None else best.decided.summary,
@@ -382,7 +387,9 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
     )
 
 
-def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...]) -> Diagnosis:
+def _diagnosis(
+    found: _Found, lost: tuple[str, ...], combinations: tuple[str, ...], known: tuple[KnownUpTo, ...]
+) -> Diagnosis:
     """Noise, faults and unmodelled forces, by name and over the rows of the given logs."""
     best, result = found.best, found.result
     intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
@@ -397,6 +404,7 @@ def _diagnosis(found: _Found, lost: tuple[str, ...], combinations: tuple[str, ..
         input_delay=late.size * intervals.dt if late else 0.0,
         input_delay_error=late.std * intervals.dt if late else np.inf,
         input_delay_significant=found.is_late,
+        known_up_to=known,
         suggested_terms=by_acceleration(intervals, (forces or accelerations)[1]) if len(accelerations) > 1 else {},
     )
 
