@@ -296,7 +296,8 @@ def unidentifiable(
     known_up_to : tuple of KnownUpTo
         Those of these sentences in which a combination is determined, with the names.
     """
-    of_model = [x for x in structural(model, measured, ranges) if not any(set(x.names) <= set(n) for n, _ in of_units)]
+    of_model = structural(model, measured, ranges)
+    of_units = [x for x in of_units if not any(set(x[0]) <= set(one.names) for one in of_model)]
     ambiguous = {name for x in of_model for name in x.names} | {name for names, _ in of_units for name in names}
     by_equations = np.array([name in ambiguous for name in layout.owners])
     from_log = collinear(layout.names, values, covariance, uncertain & ~by_equations)

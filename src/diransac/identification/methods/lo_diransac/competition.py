@@ -138,13 +138,14 @@ def compete(
         first = with_equivalents(settings, dataset, first, seed, callback)
         if is_settled(first.likeliest, first.motion):
             return first
-    intervals, motion = whole[:2]
+    intervals, motion, notes = whole
     if first is not None:
-        intervals, motion = replace(intervals, substeps=first.likeliest.intervals.substeps), first.motion
+        own, motion, notes = first.likeliest.intervals, first.motion, first.notes
+        intervals = replace(intervals, substeps=own.substeps, recorded=own.recorded)
     contest = Contest(settings, dataset, intervals, motion, seed, callback)
     try:
         contest.add_sources(first)
-        found = contest.outcome(first, whole[2])
+        found = contest.outcome(first, notes)
     except TimeLimitError:
         if first is None:
             raise

@@ -38,8 +38,8 @@ _ABSURD = 3.0
 """Factor of the least force that is left, from which on an estimate fails absurdly that leaves more than the force."""
 _AS_WELL = 0.02
 """Difference of the logarithms of losses that does not count."""
-_NEGLIGIBLE, _ROUNDING = 1e-6, 1e-12
-"""Loss in comparison with which all are equal: a thousandth of the motion."""
+_NEGLIGIBLE, _ROUNDING = 1e-5, 1e-12
+"""Loss in comparison with which all are equal: three thousandths of the motion."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,17 +107,22 @@ def _log_losses(scores: Sequence[Scores], forces: FloatArray) -> FloatArray:
     """Logarithms ``(n, n_blocks)`` of the losses of both directions, as far as they tell candidates apart.
 
     Over other horizons an unstable machine is lost, and estimates that respond less to their inputs have the smaller
-    errors.  Where no horizon tells them apart, all of them count.
+    errors.  Where no horizon tells them apart, all of them count.  Where all of the motion is predicted, forces do not
+    count: their errors are those of smoothing.
     """
     least = np.fmin.reduce([x.errors for x in scores])
     told = least < _CLEARLY if (least < _CLEARLY).any() else least < np.inf
-    forward = means_of_known(np.array([x.losses[told] for x in scores]).swapaxes(1, 2))
-    logs = np.log(forward + _NEGLIGIBLE)
+    logs = _log_means(np.array([x.losses[told] for x in scores]))
     telling = np.fmin.reduce(means_of_known(forces)) < _EXPLAINED**2
-    if not telling.any():
+    if not telling.any() or np.exp(_overall(logs)).min() < 2.0 * _NEGLIGIBLE:
         return logs
-    inverse = np.log(means_of_known(np.log1p(forces[:, telling]).swapaxes(1, 2)) + _NEGLIGIBLE)
+    inverse = _log_means(np.log1p(forces[:, telling]))
     return np.asarray(0.5 * (logs + np.where(np.isfinite(inverse), inverse, logs)))
+
+
+def _log_means(losses: FloatArray) -> FloatArray:
+    """Logarithms ``(n, n_blocks)`` of mean losses ``(n, k, n_blocks)`` over k horizons or equations."""
+    return np.asarray(np.log(means_of_known(losses.swapaxes(1, 2)) + _NEGLIGIBLE))
 
 
 def _fails_absurdly(forces: FloatArray) -> BoolArray:
