@@ -9,16 +9,19 @@ RUNTIME := .venv/.runtime
 ENVIRONMENT := .venv/.installed
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e
 
-.PHONY: demo test quick fuzz lint bench docs docs-figures coverage lock clean
+.PHONY: demo test quick acceptance fuzz lint bench docs docs-figures coverage lock clean
 
 demo: $(RUNTIME)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
 
-test: lint docs  ## everything that must hold
-	$(BIN)/pytest -q $(PARALLEL)
+test: lint docs  ## everything that must hold, but for records that take more than 15 s of a processor
+	$(BIN)/pytest -q $(PARALLEL) -m "not long"
 
 quick: $(ENVIRONMENT)  ## tests without the slow ones
 	$(BIN)/pytest -q $(PARALLEL) -m "not slow"
+
+acceptance: $(ENVIRONMENT)  ## twenty logs and random machines, with the records that take long
+	$(BIN)/pytest -q -rx $(PARALLEL) tests/acceptance
 
 # Others every time; FUZZ_EXAMPLES files of each kind.
 FUZZ_EXAMPLES ?= 200
@@ -42,7 +45,7 @@ docs-figures: $(ENVIRONMENT)  ## every command behind a number of the pages that
 	$(BIN)/python benchmarks/documented.py --run
 
 coverage: $(ENVIRONMENT)
-	$(BIN)/pytest -q --cov --cov-report=term
+	$(BIN)/pytest -q -m "not long" --cov --cov-report=term
 
 lock: $(ENVIRONMENT)  ## pin every dependency anew
 	$(BIN)/pip-compile --quiet --extra dev --strip-extras --upgrade --no-emit-index-url --no-emit-trusted-host \
