@@ -75,9 +75,15 @@ def renewed(shown: str, printed: str) -> str:
         found += [ABRIDGED] if any(map(str.strip, lines[last + 1 : k])) else []
         if k < len(lines):
             found += [""] if found and k and not lines[k - 1].strip() else []
-            found.append(line if ABRIDGED in line and is_same_line(line, lines[k]) else lines[k])
+            found.append(cut(lines[k], line))
         last = k
     return "\n".join([*found, ""])
+
+
+def cut(line: str, shown: str) -> str:
+    """A line after as many words as a shown one, if that is abridged at its end."""
+    words = len(shown.removesuffix(ABRIDGED).split())
+    return re.match(rf"(\s*\S+){{0,{words}}}", line)[0] + f" {ABRIDGED}" if shown.endswith(ABRIDGED) else line
 
 
 def nearest(kept: list[str], lines: list[str]) -> list[int | None]:
@@ -95,5 +101,5 @@ def nearest(kept: list[str], lines: list[str]) -> list[int | None]:
 
 def alike(shown: str, printed: str) -> float:
     """Part of two lines that is equal, by words and without their numbers."""
-    one, other = (NUMBER.sub("0", x).split() for x in (shown, printed))
+    one, other = (NUMBER.sub("0", x).split() for x in (shown, cut(printed, shown)))
     return 1.0 if is_same_line(shown, printed) else SequenceMatcher(None, one, other, autojunk=False).ratio()

@@ -145,6 +145,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_proce
     if SHARED.is_dir():
         cut_short(tmp_path / "shared" / "data")
     monkeypatch.chdir(checkout)
+    monkeypatch.syspath_prepend(checkout)  # as where a session of Python begins
     return checkout
 
 

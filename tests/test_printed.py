@@ -63,5 +63,6 @@ def test_blocks_are_renewed_as_abridged_as_they_were_and_then_agree():
     assert now == "machine ...\n...\nmass       20.4132   19.9 .. 20.9   kg\n...\n\nverdict: usable\n...\n"
     assert agrees(now, PRINTED)
     assert renewed(now, PRINTED) == now
+    assert renewed("...\nmass 9.3 ...\n...\n", PRINTED) == "...\nmass       20.4132 ...\n...\n"
     assert renewed("mass 3\n", PRINTED) == PRINTED  # that nothing was left out is kept, too
     assert not renewed(shown, "")
