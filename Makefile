@@ -9,7 +9,7 @@ RUNTIME := .venv/.runtime
 ENVIRONMENT := .venv/.installed
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e
 
-.PHONY: demo test quick acceptance fuzz lint bench docs docs-figures coverage lock clean
+.PHONY: demo test quick acceptance fuzz lint bench docs docs-printed docs-figures coverage lock clean
 
 demo: $(RUNTIME)  ## fly, identify, fly what was identified; writes out/demo/report.html and flight.png
 	$(BIN)/python examples/demo.py
@@ -41,7 +41,10 @@ bench: $(ENVIRONMENT)  ## measured figures; each benchmark prints its table
 docs: $(ENVIRONMENT)  ## the pages; --quiet would let warnings pass
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir out/site
 
-docs-figures: $(ENVIRONMENT)  ## every command behind a number of the pages that has no output yet; many hours
+docs-printed: $(ENVIRONMENT)  ## what commands of the pages print today, written into the pages; a minute
+	RENEW_PAGES=1 $(BIN)/pytest -q $(PARALLEL) tests/test_documentation.py -k runs_as_it_is_shown
+
+docs-figures: $(ENVIRONMENT)  ## every command behind a number of the pages that has no output yet, compared with it; many hours
 	$(BIN)/python benchmarks/documented.py --run
 
 coverage: $(ENVIRONMENT)

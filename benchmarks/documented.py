@@ -2,7 +2,8 @@
 
 Run it as ``python benchmarks/documented.py [--run] [TEXT ...]``: those that hold a text, all by default.  With
 ``--run``, as ``make docs-figures`` has it, each that has no output yet runs in ``out/docs-figures`` and leaves what it
-prints there; all of them take many hours.  Blocks that the tests run are not among them.
+prints there, which is compared with what pages show of it; all of them take many hours.  Blocks that the tests run are
+not among them.
 """
 
 import argparse
@@ -12,6 +13,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from printed import disagreement
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "out" / "docs-figures"
@@ -35,10 +38,27 @@ def commands(page: str) -> Iterator[str]:
                 yield command
 
 
+def outputs(page: str) -> dict[str, str]:
+    """What a page shows below a command that the tests do not run, in a block that begins with a ``$``."""
+    found = dict[str, str]()
+    for body in re.findall(r"^ *```text\n(\$ .*?)^ *```", page, re.DOTALL | re.MULTILINE):
+        for line in re.sub(r"\\\n", " ", body).splitlines(keepends=True):
+            if line.startswith("$ "):
+                command = line[2:].strip()
+            else:
+                found[command] = found.get(command, "") + line
+    return found
+
+
 def documented(texts: list[str]) -> list[str]:
     """All commands that hold one of the texts, each once."""
     found = dict.fromkeys(x for page in pages() for x in commands(page.read_text("utf-8")))
     return [x for x in found if not texts or any(text in x for text in texts)]
+
+
+def target_of(command: str) -> Path:
+    """File of a command's output."""
+    return FOLDER / f"{re.sub(r'[^A-Za-z0-9.]+', '-', command).strip('-')[:120]}.txt"
 
 
 def run(command: str) -> int:
@@ -48,7 +68,7 @@ def run(command: str) -> int:
         words = [sys.executable, str(REPOSITORY / words[1]), *words[2:]]
     else:
         words = [sys.executable, "-m", *words]
-    target = FOLDER / f"{re.sub(r'[^A-Za-z0-9.]+', '-', command).strip('-')[:120]}.txt"
+    target = target_of(command)
     if target.exists():
         return 0
     draft = target.with_suffix(".part")
@@ -66,11 +86,15 @@ def main() -> None:
     parser.add_argument("texts", nargs="*", metavar="TEXT")
     parser.add_argument("--run", action="store_true", help="run those that have no output yet")
     chosen = parser.parse_args()
+    shown = {command: text for page in pages() for command, text in outputs(page.read_text("utf-8")).items()}
     failed = []
     for command in documented(chosen.texts):
         print(command, flush=True)
         if chosen.run and run(command):
             failed.append(command)
+        elif chosen.run and command in shown:
+            difference = disagreement(shown[command], target_of(command).read_text("utf-8"))
+            failed += [f"{command}: the page shows something else\n{difference}"] if difference else []
     if failed:
         sys.exit("\n".join(["failed:", *failed]))
 

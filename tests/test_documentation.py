@@ -7,20 +7,30 @@ A page runs from top to bottom in a folder of its own, with ``examples/`` inside
 - a ``python`` or ``toml`` block whose first line is a comment that names a file (``# rover.py``) is written to that
   file;
 - in every ``console`` block, each ``$ diransac ...`` line in this process, trials of its studies included, and each
-  ``$ python ...`` line in its own; both may be continued over ``\`` at a line's end. Lines of `NOT_RUN` are shown only.
-  Any other command belongs into a ``text`` block, as does what cannot run.
+  ``$ python ...`` line in its own; both may be continued over ``\`` at a line's end. Lines of `NOT_RUN` are shown only;
+- every ``text`` block is what the block before it printed (`printed` has the rules of the comparison), or it shows
+  commands that are not run here, each behind a ``$``. What those print is shown only of the commands of `LONG`.
+  Formulas, diagrams and code of other languages have a fence without a language.
+
+``make docs-printed`` writes today's output into the pages.
 """
 
+import contextlib
+import io
+import os
 import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import documented
 import pytest
+from printed import disagreement, renewed
 from typer.testing import CliRunner
 
 from diransac.cli.commands import app
@@ -34,6 +44,10 @@ NOT_RUN = {"cd", "git", "make", "pip"}
 NEEDS = {"robots.md": "mujoco", "logs.md": "mcap", "tutorial.md": "mcap"}
 """Package without which a page is not run."""
 LANGUAGES = {"", "python", "console", "text", "toml", "json", "yaml", "csv", "mermaid"}
+LONG = {"python benchmarks/fleet.py": "200 identifications", "python benchmarks/kills.py": "200 processes"}
+"""Commands whose output is shown but takes too long for a test, and why; ``make docs-figures`` compares it."""
+RENEWED = "RENEW_PAGES" in os.environ
+"""Whether output is written into the pages, not compared with them."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +73,11 @@ def commands(body: str) -> list[list[str]]:
     return [shlex.split(line[2:], comments=True) for line in joined.splitlines() if line.startswith("$ ")]
 
 
-def run_command(command: list[str], folder: Path) -> None:
-    """Run one command line of a page in its folder, the working directory; its output is the failure's message."""
+def run_command(command: list[str], folder: Path) -> str:
+    """Run one command line of a page in its folder, the working directory, and return what it prints."""
     program, *arguments = command
     if program in NOT_RUN:
-        return
+        return ""
     assert program in {"diransac", "python"}, f"{shlex.join(command)}: this cannot be run; show it in a text block"
     if program == "diransac":
         assert folder == Path.cwd()
@@ -74,6 +88,7 @@ def run_command(command: list[str], folder: Path) -> None:
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
         code = done.returncode
     assert code == 0, f"{shlex.join(command)}: exit code {code}\n{done.stdout}{done.stderr}"
+    return done.stdout
 
 
 def write_named(block: Block, folder: Path) -> None:
@@ -83,9 +98,42 @@ def write_named(block: Block, folder: Path) -> None:
         (folder / named[1]).write_text(block.body)
 
 
-def run_python(block: Block, page: Path, namespace: dict[str, object]) -> None:
-    """Run one Python block, with the page's own line numbers in a traceback."""
-    exec(compile("\n" * (block.line - 1) + block.body, str(page), "exec"), namespace)
+def run_python(block: Block, page: Path, namespace: dict[str, object]) -> str:
+    """Run one Python block, with the page's own line numbers in a traceback, and return what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        exec(compile("\n" * (block.line - 1) + block.body, str(page), "exec"), namespace)
+    return out.getvalue()
+
+
+def run_blocks(found: list[Block], page: Path, folder: Path) -> dict[Block, str]:
+    """Run the blocks of a page from top to bottom, and return what each printed."""
+    namespace: dict[str, object] = {"__name__": "__page__"}
+    printed = dict[Block, str]()
+    for block in found:
+        if "../shared/" in block.body and block.info in {"python", "console"} and not SHARED.is_dir():
+            pytest.skip(f"{page.name} NOT CHECKED from line {block.line} on: {SHARED} is missing")
+        if block.info in {"python", "toml"}:
+            write_named(block, folder)
+        if block.info == "python":
+            printed[block] = run_python(block, page, namespace)
+        if block.info == "console":
+            printed[block] = "".join(run_command(command, folder) for command in commands(block.body))
+    return printed
+
+
+def outputs(found: list[Block]) -> Iterator[tuple[Block, Block]]:
+    """Each block that shows output, and the block that printed it."""
+    for before, block in pairwise(found):
+        if block.info == "text" and not block.body.startswith("$ "):
+            yield before, block
+
+
+def write_output(page: Path, block: Block, body: str) -> None:
+    """Write another body into a block of a page; blocks before it keep their lines."""
+    lines, first = page.read_text().splitlines(keepends=True), block.line - 1
+    indent = re.match(" *", lines[first - 1])[0]
+    lines[first : first + block.body.count("\n")] = [textwrap.indent(body, indent)]
+    page.write_text("".join(lines))
 
 
 @pytest.fixture
@@ -97,6 +145,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_proce
     if SHARED.is_dir():
         cut_short(tmp_path / "shared" / "data")
     monkeypatch.chdir(checkout)
+    monkeypatch.syspath_prepend(checkout)  # as where a session of Python begins
     return checkout
 
 
@@ -114,21 +163,29 @@ def cut_short(data: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_page_runs_as_it_is_shown(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch):
-    namespace: dict[str, object] = {"__name__": "__page__"}
     if "diransac cache --clear" in page.read_text():  # the machine code of the other tests is to stay
         monkeypatch.setenv("DIRANSAC_CACHE", str(folder / "code"))
     if page.name in NEEDS:
         pytest.importorskip(NEEDS[page.name], reason=f"{page.name} NOT CHECKED: {NEEDS[page.name]} is missing")
-    for block in blocks(page.read_text()):
-        if "../shared/" in block.body and block.info in {"python", "console"} and not SHARED.is_dir():
-            pytest.skip(f"{page.name} NOT CHECKED from line {block.line} on: {SHARED} is missing")
-        if block.info in {"python", "toml"}:
-            write_named(block, folder)
-        if block.info == "python":
-            run_python(block, page, namespace)
-        if block.info == "console":
-            for command in commands(block.body):
-                run_command(command, folder)
+    found = list(blocks(page.read_text()))
+    printed = run_blocks(found, page, folder)
+    if RENEWED:
+        for before, block in reversed([*outputs(found)]):
+            write_output(page, block, renewed(block.body, printed[before]))
+        return
+    differ = {block.line: disagreement(block.body, printed[before]) for before, block in outputs(found)}
+    wrong = [f"{page.name}, line {line}:\n{x}" for line, x in differ.items() if x]
+    if wrong:
+        pytest.fail("\n".join([*wrong, "make docs-printed writes today's output into the pages"]), pytrace=False)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_every_text_block_is_compared_or_shows_commands_that_take_too_long(page: Path):
+    found = list(blocks(page.read_text()))
+    assert not [block.line for block in found[:1] if block.info == "text" and not block.body.startswith("$ ")]
+    lost = [block.line for before, block in outputs(found) if before.info not in {"python", "console"}]
+    assert not lost, f"{page.name}: output of no block that runs; $ marks commands, no language formulas and diagrams"
+    assert set(documented.outputs(page.read_text())) <= set(LONG), f"{page.name}: run the command, or say why not"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))

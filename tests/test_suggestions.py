@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.methods.lo_diransac.missing_terms import connections
+from diransac.identification.methods.lo_diransac.missing_terms import _drawn, connections
 from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes
 from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, TermRegression
 from diransac.identification.structure.candidate_terms import CandidateTerm, RelativeMotion, candidate_terms
@@ -66,8 +67,8 @@ def units_of(made, largest=1.0):
     return largest / np.sqrt(np.square(made.terms).mean(axis=0)).max(axis=0)
 
 
-def select(made, whitened=None, parameters=None, bounds=None, largest=1.0):
-    """Terms that are selected; each is of its own kind, and any coefficient is possible unless it is said."""
+def candidates_tested(made, whitened=None, parameters=None, bounds=None, largest=1.0):
+    """Tests of terms; each is of its own kind, and any coefficient is possible unless it is said."""
     n_terms = made.terms.shape[2]
     parameters = range(n_terms) if parameters is None else parameters
     bounds = {} if bounds is None else bounds
@@ -75,8 +76,12 @@ def select(made, whitened=None, parameters=None, bounds=None, largest=1.0):
         CandidateTerm(f"kind {k}", "q", "q", "", "", f"p{x}", "", ca.SX(1), bounds.get(k, (-np.inf, np.inf)))
         for k, x in enumerate(parameters)
     ]
-    found = CandidateTests(tuple(terms), units_of(made, largest), whitened or regression(made)).selected()
-    return [k for one in found for k in one]
+    return CandidateTests(tuple(terms), units_of(made, largest), whitened or regression(made))
+
+
+def select(made, *arguments, **options):
+    """Indices of the terms that are selected."""
+    return [x.index for x in candidates_tested(made, *arguments, **options).selected()]
 
 
 def autocorrelated(rng, n, rho=0.9):
@@ -126,6 +131,48 @@ def test_two_terms_that_hide_each_other_are_found_together():
         assert sorted(select(made, largest=80.0)) == [4, 6]
         values, errors = whitened.joint([4, 6])
         assert np.all(np.abs(values - [-8.0, 8.0]) < 5.0 * errors)
+
+
+def test_a_term_of_which_the_log_hardly_tells_the_form_is_suggested_with_the_other_form_and_others_beside_it():
+    """The form cannot be told, but that the model lacks it can; a term in another equation is sought all the same."""
+    right = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        made = made_of(rng, force=0.3 * rng.standard_normal((120, 2)))
+        terms = made.terms.copy()
+        terms[:, 0, 4] = terms[:, 0, 6] + 0.1 * rng.standard_normal(120)
+        made = replace(made, terms=terms, force=made.force - 0.8 * terms[:, :, 6] + 0.4 * terms[:, :, 9])
+        found = {x.index: x.rivals for x in candidates_tested(made).selected()}
+        assert len(found) == 2
+        assert found.pop(9) == ()
+        ((one, others),) = found.items()
+        assert one in (4, 6)
+        right += 6 in (one, *others)
+    assert right >= 19
+
+
+def test_a_term_that_the_log_separates_from_all_others_has_no_rival():
+    rng = np.random.default_rng(0)
+    made = made_of(rng, force=0.3 * rng.standard_normal((120, 2)))
+    terms = made.terms.copy()
+    terms[:, 0, 4] = terms[:, 0, 6] + 1.5 * rng.standard_normal(120)
+    made = replace(made, terms=terms, force=made.force - 0.8 * terms[:, :, 6])
+    assert [(x.index, x.rivals) for x in candidates_tested(made).selected()] == [(6, ())]
+
+
+def test_a_single_term_counts_before_a_pair_that_is_hardly_more_probable():
+    more_probable = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        made = made_of(rng, force=0.3 * rng.standard_normal((120, 2)))
+        terms, apart = made.terms.copy(), rng.standard_normal(120)
+        terms[:, 0, 4], terms[:, 0, 8] = 0.5 * terms[:, 0, 6] + apart, 0.5 * terms[:, 0, 6] - apart
+        force = made.force - 0.8 * terms[:, :, 6] - 0.1 * (terms[:, :, 4] - terms[:, :, 8])
+        made = replace(made, terms=terms, force=force)
+        odds = {x.members: x.log_odds for x in candidates_tested(made, largest=10.0).sets()}
+        more_probable += odds.get((4, 8), -np.inf) > odds[6,]
+        assert select(made, largest=10.0) == [6]
+    assert more_probable > 5
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
@@ -436,6 +483,23 @@ def test_what_an_actuator_does_to_its_input_is_suggested(name, actuator):
     assert {name: found.parameters[name] for name in true} == pytest.approx(true, rel=0.05)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_gravity_that_may_be_a_spring_is_suggested_and_both_are_named(seed):
+    """Over small angles and three seconds they are nearly the same torque."""
+    model = dr.Model(
+        "turntable",
+        {"q": "rad"},
+        {"torque": "N m"},
+        {"inertia": dr.Parameter("kg m^2", positive=True), "damping": dr.Parameter("N m s/rad")},
+        lambda q, v, a, u, p: [p.inertia * a.q + p.damping * v.q - u.torque],
+    )
+    result = dr.identify(model, swing(seed=seed, rows=300), differentiate=True)
+    (found,) = result.suggestions
+    assert {"gravity torque about q", "spring on q"} <= {found.name, *found.rivals}
+    assert f"and this log does not exclude {' or '.join(found.rivals)} in its place" in found.text
+    assert dr.Result.from_dict(result.to_dict()).suggestions == result.suggestions
+
+
 def test_a_users_own_term_is_suggested_where_it_explains_more():
     log = swing(lambda w: 0.004 * w * w * w)
     method = dr.LoDiransac(candidate_terms=lambda q, v, u: {"cubic": v.q**3})
@@ -520,6 +584,14 @@ def test_springs_dampers_and_conductances_connect(model, expected):
     assert len(found) == len(expected)
     for pair, known in zip(found, expected, strict=True):
         np.testing.assert_allclose(pair, known, atol=1e-9)
+
+
+def test_terms_of_a_model_without_finite_accelerations_are_not_tested():
+    model, rng = two_masses(), np.random.default_rng(0)
+    motion = [rng.standard_normal((50, n)) for n in (2, 2, 2, 1)]
+    drawn = SimpleNamespace(model=model, counted=np.ones(50, bool))
+    with pytest.raises(np.linalg.LinAlgError, match="no finite acceleration"):
+        _drawn(drawn, [*motion, np.full((50, 4), [1.0, 1e200, 1.0, 1e200])])
 
 
 def test_slopes_of_the_inertia_are_those_of_its_logarithm():

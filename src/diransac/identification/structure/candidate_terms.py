@@ -146,7 +146,9 @@ class CandidateTerms:
             found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
         return found
 
-    def suggestion(self, k: int, value: float, error: float, explained: float) -> Suggestion:
+    def suggestion(
+        self, k: int, value: float, error: float, explained: float, rivals: Sequence[int] = ()
+    ) -> Suggestion:
         """Term k in words and as a line of model code.
 
         Parameters
@@ -156,6 +158,8 @@ class CandidateTerms:
             Coefficient and its standard error.
         explained : float
             Fraction of the mean square of the unmodelled force that the term explains.
+        rivals : sequence of int, optional
+            Terms that explain the same in its place.
 
         Returns
         -------
@@ -165,7 +169,9 @@ class CandidateTerms:
         digits = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0.0 else 3
         size, spread = (f"{x:.{digits}f}" if digits < 6 else f"{x:.3g}" for x in (value, error))
         unit = f" {term.unit}" if term.unit not in ("", "1") else ""
+        others = tuple(dict.fromkeys(self.terms[j].name for j in rivals))
         share = f"explains {100.0 * explained:.0f} % of the unmodelled force"
+        share += f", and this log does not exclude {' or '.join(others)} in its place" if others else ""
         if term.kind == INPUT_GAIN:
             text = f"Gain of {term.place}: an error of {size} ± {spread} {share}"
         else:
@@ -174,7 +180,7 @@ class CandidateTerms:
         h = ca.Function("term", list(self.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
         return Suggestion(
             term.kind, term.equation, text, term.parameter, value, error, term.unit, explained,
-            term.code, expressions.stored(f"term {term.parameter}", h), term.name, term.also,
+            term.code, expressions.stored(f"term {term.parameter}", h), term.name, term.also, others,
         )  # fmt: skip
 
 
@@ -300,7 +306,7 @@ class _Maker:
         yield from self.of_own_motion(place)
         for k, (name, unit) in enumerate(self.model.coordinates.items()):
             if place.position is not None and name == place.name:
-                yield from self._of_springs(place, 1 if unit == "rad" else 3)
+                yield from self._of_springs(place)
             if unit == "rad":
                 yield from self._of_angle(place, self.symbols[0][k], name)
         yield from self._of_other_speeds(place)
@@ -310,7 +316,7 @@ class _Maker:
         place = self.place(motion)
         yield from self.of_own_motion(place)
         if place.position is not None:
-            yield from self._of_springs(place, 3)
+            yield from self._of_springs(place)
 
     def of_own_motion(self, place: _Place) -> Iterator[CandidateTerm]:
         """Friction and drag, or decay of states of first order, and a constant."""
@@ -341,9 +347,9 @@ class _Maker:
             value = sign * ca.exp(-((v / slow) ** 2))
             yield self._term("Stribeck friction", place, "stribeck", _Expression(value, formula, decay, ""))
 
-    def _of_springs(self, place: _Place, most: int) -> Iterator[CandidateTerm]:
+    def _of_springs(self, place: _Place) -> Iterator[CandidateTerm]:
         assert place.position is not None
-        for n, kind in ((1, ""), (2, "quadratic "), (3, "cubic "))[:most]:
+        for n, kind in ((1, ""), (2, "quadratic "), (3, "cubic ")):
             label = f"{kind}stiffness".replace(" ", "_")
             yield self._term(f"{kind}stiffness", place, label, _power(place.position, n))
 

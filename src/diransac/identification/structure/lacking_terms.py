@@ -300,6 +300,8 @@ class Suggestion:
         Name in an engineer's words, such as ``dry friction of x``.
     also : mapping of str to str, optional
         Further equations that lack the term, as one between two bodies, and their code.
+    rivals : tuple of str, optional
+        Names of terms that explain the same in its place, which the logs do not exclude.
     """
 
     kind: str
@@ -314,6 +316,7 @@ class Suggestion:
     term: Mapping[str, Any]
     name: str = ""
     also: Mapping[str, str] = field(default_factory=dict)
+    rivals: tuple[str, ...] = ()
 
     @property
     def declaration(self) -> str:

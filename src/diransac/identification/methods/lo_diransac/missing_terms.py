@@ -179,13 +179,13 @@ def missing_terms(found: Candidates) -> MissingTerms:
     MissingTerms
     """
     tests = found.tests(beside_delays=True)
-    regression, sets = tests.regression, tests.selected()
-    chosen, first = [k for one in sets for k in one], [k for one in sets[:1] for k in one]
+    regression, selected = tests.regression, tests.selected()
+    chosen, first = [x.index for x in selected], [x.index for x in selected if x.members == selected[0].members]
     values, errors = regression.joint(chosen)
     suggestions = []
-    for i, (k, value, error) in enumerate(zip(chosen, values.tolist(), errors.tolist(), strict=True)):
-        share = regression.beside(*chosen[:i], *chosen[i + 1 :]).explained(k)
-        suggestions.append(found.library.suggestion(k, value, error, share))
+    for i, (one, value, error) in enumerate(zip(selected, values.tolist(), errors.tolist(), strict=True)):
+        share = regression.beside(*chosen[:i], *chosen[i + 1 :]).explained(one.index)
+        suggestions.append(found.library.suggestion(one.index, value, error, share, one.rivals))
     explained = regression.force - regression.beside(*chosen).force
     accelerations = np.linalg.solve(found.inertia, explained[:, :, None])[:, :, 0]
     change = regression.effects[:, first] @ regression.joint(first)[0]
@@ -322,7 +322,10 @@ class _DrawnMotion:
 
 
 def _drawn(intervals: ShootingIntervals, motion: Sequence[FloatArray]) -> _DrawnMotion:
-    """Motions of the model, with velocities and inputs in proportions that they need not have had in the log."""
+    """Motions of the model, with velocities and inputs in proportions that they need not have had in the log.
+
+    Raises LinAlgError: parameters are so tiny or huge that no acceleration is finite.
+    """
     model, rng = intervals.model, np.random.default_rng(_SEED)
     n = max(_DRAWS, _PER_PARAMETER * model.n_p)
     rows, fixed = np.flatnonzero(intervals.counted), [i for four in model.quaternions for i in four]
@@ -339,6 +342,8 @@ def _drawn(intervals: ShootingIntervals, motion: Sequence[FloatArray]) -> _Drawn
     p = parameters[rng.choice(rows, n)]
     with np.errstate(all="ignore"):
         a, W = equations_of_rows(model, q, v, u, p)
+    if not np.isfinite(W).all(axis=(1, 2)).any():
+        raise np.linalg.LinAlgError("the model has no finite acceleration with these parameters")
     return _DrawnMotion((q, v, a, u, p), W)
 
 

@@ -15,7 +15,9 @@ A term that the log excludes has a small one, as the prior was much wider than w
 factor).  One that the log does not show either way has BF = 1 and the variance of its prior: if it is correlated with a
 parameter, that is uncertain.  Where the model lacks two terms, each may explain nothing alone: pairs compete with
 single terms, by the Bayes factor of two coefficients.  A term or a pair whose odds exceed what the choice among all
-gives by chance is suggested, and the next is sought beside it (forward selection).
+gives by chance is suggested, and the next is sought beside it (forward selection).  That the model lacks a term can be
+certain where its form is not: another term that is about as probable, and that the log does not show beside the
+suggested one, is named with it.
 
 References
 ----------
@@ -183,6 +185,25 @@ class TermSet:
     covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class SelectedTerm:
+    """A term that a fit lacks.
+
+    Parameters
+    ----------
+    index : int
+        Index of the term.
+    members : tuple of int
+        It, and the other one of its pair.
+    rivals : tuple of int
+        Indices of terms that explain the same in its place.
+    """
+
+    index: int
+    members: tuple[int, ...]
+    rivals: tuple[int, ...]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class CandidateTests:
     """Tests of K candidates at a fit.
@@ -269,22 +290,21 @@ class CandidateTests:
         factors = posterior(gram[pairs[:, :, None], pairs[:, None, :]], values[pairs], prior[pairs])[0]
         return pairs, factors + odds[pairs].sum(axis=1)
 
-    def selected(self) -> list[tuple[int, ...]]:
-        """Terms, or pairs of them, that explain what a fit leaves, the most probable first."""
+    def selected(self) -> list[SelectedTerm]:
+        """Terms that explain what a fit leaves, the most probable first, each alone or with that of its pair."""
         effects = np.array([x.parameter for x in self.terms])
-        chosen, allowed, tests = list[tuple[int, ...]](), np.ones(len(self.terms), bool), self
+        chosen, allowed, tests = list[SelectedTerm](), np.ones(len(self.terms), bool), self
         sets = tests.sets()
         while sets := [x for x in sets if x.log_odds >= self.least and allowed[list(x.members)].all()]:
-            largest = max(x.log_odds for x in sets)
-            most = min((x for x in sets if x.log_odds > largest - _EQUAL), key=lambda x: x.members)
+            # A pair counts before a single term where it is as clearly more probable as than either of its own.
+            odds = [x.log_odds - self.least * (len(x.members) - 1) for x in sets]
+            most = min((x for x, y in zip(sets, odds, strict=True) if y > max(odds) - _EQUAL), key=lambda x: x.members)
             if not all(tests._is_possible(k, most.members) for k in most.members):
                 sets.remove(most)
                 continue
-            is_replaceable = {k: tests._is_replaceable(k, most.members) for k in most.members}
-            if all(is_replaceable.values()):
-                break
             alone = {k: x.log_odds for x in tests.alone() for k in x.members}
-            chosen.append(tuple(sorted(most.members, key=lambda k: (is_replaceable[k], -alone[k]))))
+            found = [SelectedTerm(k, most.members, tests._rivals(k, most.members)) for k in most.members]
+            chosen += sorted(found, key=lambda x: (bool(x.rivals), -alone[x.index]))
             allowed &= ~np.isin(effects, effects[list(most.members)])
             tests = tests.beside(*most.members)
             sets = tests.sets()
@@ -296,13 +316,22 @@ class CandidateTests:
         share = self.regression.beside(*(x for x in members if x != k)).explained(k)
         return bool(low < value < high and abs(value) > _SMALLEST * self.units[k] and share > _SHARE)
 
-    def _is_replaceable(self, k: int, members: tuple[int, ...]) -> bool:
-        """True if another term is as probable beside the rest, and the log determines but does not show it beside k."""
-        tests = self.beside(*(x for x in members if x != k))
-        beside, effect = tests.beside(k), self.terms[k].parameter
+    def _rivals(self, k: int, members: tuple[int, ...]) -> tuple[int, ...]:
+        """Terms as probable as one beside the rest of its set that the log determines but does not show beside it.
+
+        Of each effect the most probable form, of all of them the most probable first.
+        """
+        rest = tuple(x for x in members if x != k)
+        tests, own = self.beside(*rest), {self.terms[x].parameter for x in members}
+        beside = tests.beside(k)
         before, after = (np.array([x.log_odds for x in y.alone()]) for y in (tests, beside))
-        other = np.array([x.parameter != effect for x in self.terms]) & np.isfinite(beside.regression.estimates()[1])
-        return bool((other & (after <= 0.0) & (before > before[k] - _EVIDENCE)).any())
+        known = np.isfinite(beside.regression.estimates()[1])
+        alike = np.flatnonzero(known & (after <= 0.0) & (before > before[k] - _EVIDENCE))
+        found = dict[str, int]()
+        for j in sorted(alike.tolist(), key=lambda j: -before[j]):
+            if self.terms[j].parameter not in own and self._is_possible(j, (*rest, j)):
+                found.setdefault(self.terms[j].parameter, j)
+        return tuple(found.values())
 
 
 def posterior(
