@@ -34,7 +34,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, refine_further, start
-from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG
+from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG, ShootingIntervals
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
@@ -206,8 +205,23 @@ class LocalSearch:
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:
                 break
-            best = self._accurate(min(found, key=lambda x: x.cost))
+            best = self._accurate(self._without_superfluous(min(found, key=lambda x: x.cost)))
             yield best
+
+    def _without_superfluous(self, found: Explanation) -> Explanation:
+        """The explanation with a timing of some inputs instead of one of all and another of the others, if it will do.
+
+        That of all inputs is found first where one is late; those that are not then seem early by as much.
+        """
+        intervals, fewer = found.intervals, list[ShootingIntervals]()
+        sizes, sought = intervals.all_errors.sizes, self._sought(found)
+        for common in (x for x in map(intervals.all_inputs, LATE) if x in sizes and x in sought):
+            alone = intervals.without_error(common)
+            for own in (x for x in sizes if x.of_inputs and x.what == common.what and x != common):
+                rest = replace(common, columns=tuple(x for x in common.columns if x not in own.columns))
+                fewer += [alone, alone.without_error(own).with_input_error(rest, sizes[common])]
+        leanest = min((self._moved(found, x) for x in fewer), key=lambda x: x.cost, default=found)
+        return leanest if leanest.cost < found.cost + AS_LIKELY else found
 
     def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation) -> Explanation:
         """The likeliest explanation of a part of some logs, from a fit of that part with the freedom of all.
@@ -259,8 +273,8 @@ class LocalSearch:
     def _sought(self, best: Explanation) -> list[ErrorKind]:
         """Errors of recordings that the settings leave to the evidence.
 
-        Where the model is exact, all inputs, groups of signals and single signals of its measurement equations are
-        tested: nothing else depends on the latter, so that the motion is as likely whatever their delay.
+        Where the model is exact, inputs, groups of signals and single signals of its measurement equations are tested:
+        nothing else depends on the latter, so that the motion is as likely whatever their delay.
         """
         intervals, settings = best.intervals, self.settings
         model, alone = intervals.model, np.full(len(intervals.model.signals), not best.exact)
@@ -274,7 +288,7 @@ class LocalSearch:
             if kind in late:
                 other = settings.input_lag if kind.what == "delay" else settings.input_delay
                 return switches[kind.what] is not False and not other
-            if kind.of_inputs and (best.exact or switches.get(kind.what) is False):
+            if kind.of_inputs and switches.get(kind.what) is False:
                 return False
             return own[kind.what] is None
 

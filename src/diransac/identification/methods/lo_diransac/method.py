@@ -94,7 +94,7 @@ class LoDiransac(LoDiransacSettings):
         clearly.
     max_recording_errors : int, optional
         Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
-        is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
+        is exact, only those of inputs, of groups of sensors, and of sensors with a measurement equation.
     substeps : int, optional
         Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
         One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
