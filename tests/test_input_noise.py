@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 import regime_flights as flights
@@ -109,3 +110,21 @@ def test_errors_of_inputs_act_as_other_inputs_would():
     by_errors = noisy.simulated(p, x, e)[1]
     by_inputs = replace(other, discrepancies=False).simulated(p, x, np.zeros_like(e))[1]
     np.testing.assert_allclose(by_errors, by_inputs, rtol=1e-9, atol=1e-12)
+
+
+def test_a_model_without_inputs_that_something_pushes_is_identified():
+    model = dr.Model(
+        "free pendulum", {"q": "rad"}, {}, {"k": dr.Parameter("1/s^2"), "d": dr.Parameter("1/s")},
+        lambda q, v, a, u, p: [a.q + p.k * ca.sin(q.q) + p.d * v.q],
+    )  # fmt: skip
+    rng, h, (q, v), states = np.random.default_rng(0), 1e-3, (1.0, 0.0), []
+    for _ in range(1500):
+        states.append((q, v))
+        push = 2.0 * rng.standard_normal()
+        for _ in range(10):  # semi-implicit Euler
+            v += h * (push - 9.0 * np.sin(q) - 0.2 * v)
+            q += h * v
+    y = np.array(states) + 1e-3 * rng.standard_normal((1500, 2))
+    found = dr.identify(model, dr.Log.from_arrays(0.01 * np.arange(1500), {"q": y[:, 0], "q_dot": y[:, 1]}), seed=0)
+    assert found.parameters["k"] == pytest.approx(9.0, rel=0.05)
+    assert set(found.noise) == {"q", "q_dot"}
