@@ -96,6 +96,8 @@ class Diagnosis:
     suggested_terms : mapping of str to (W,) array, optional
         What suggested terms explain of each unmodelled force, or of each acceleration where there are no forces, beside
         the parameters that would change with them; empty without suggestions.
+    input_noise : mapping of str to float, optional
+        Standard deviation of the white noise of each input that shows it, its unit.
     """
 
     noise_std: Values
@@ -114,10 +116,11 @@ class Diagnosis:
     combinations: tuple[str, ...] = ()
     known_up_to: tuple[tuple[tuple[str, ...], str], ...] = ()
     suggested_terms: Series = field(default_factory=dict)
+    input_noise: Values = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         series = [self.window_log, self.unmodelled_time, self.smoothed_time]
-        for name in ("noise_std", "outlier_fraction", "outliers", *_BY_WINDOW):
+        for name in ("noise_std", "outlier_fraction", "outliers", "input_noise", *_BY_WINDOW):
             values = dict(getattr(self, name))
             series += [x for x in values.values() if isinstance(x, np.ndarray)]
             object.__setattr__(self, name, MappingProxyType(values))
@@ -161,12 +164,12 @@ class Diagnosis:
         return self.combinations or tuple(each)
 
     def lines(self, units: Mapping[str, str]) -> list[list[str]]:
-        """Rows of a table: signal, noise, outliers, and the RMS that the model does not explain.
+        """Rows of a table: signal or noisy input, noise, outliers, and the RMS that the model does not explain.
 
         Parameters
         ----------
         units : mapping of str to str
-            Unit of each signal.
+            Unit of each signal and input.
 
         Returns
         -------
@@ -179,6 +182,7 @@ class Diagnosis:
             fraction = f"{100.0 * self.outlier_fraction[name]:.1f} %" if measured else ""
             unexplained = "" if latent is None else f"{np.sqrt(np.mean(np.square(latent))):.2g}"
             rows.append([name, noise, fraction, unexplained, units[name]])
+        rows += [[name, f"{std:.2g}", "", "", units[name]] for name, std in self.input_noise.items()]
         return rows
 
 

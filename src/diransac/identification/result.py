@@ -403,6 +403,11 @@ class Result:
         return self.estimate.diagnosis
 
     @property
+    def noise(self) -> Mapping[str, float]:
+        """Standard deviation of the noise of each signal, and of the inputs that show it; empty without a diagnosis."""
+        return {} if self.diagnosis is None else {**self.diagnosis.noise_std, **self.diagnosis.input_noise}
+
+    @property
     def separates_forces(self) -> bool:
         """True if the method separates unmodelled forces from noise; a simulation of a whole log adds them up."""
         return self.diagnosis is not None

@@ -324,6 +324,7 @@ def _signal_table(entry: Entry, found: Diagnosis, several: bool) -> Table:
         values = found.unmodelled_accelerations.get(name)
         unmodelled = "" if values is None else number(float(np.sqrt(np.mean(np.square(values)))), 2)
         rows.append((name, units[name], noise, outliers, unmodelled))
+    rows += [(name, units[name], number(std, 2), "–", "") for name, std in found.input_noise.items()]
     caption = f"By {entry.label}" if several else "By signal"
     if any(run.held_out for run in entry.runs):
         caption = f"{caption}, in the identification ({', '.join(s.source for s in entry.result.logs)})"

@@ -21,6 +21,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | `integration_steps.py` | as few integration steps as leave the fit |
 | **errors of recordings** | |
 | `recording_errors.py`, `joint_equations.py` | delays, biases, lags, drifts: their search, and as unknowns of a fit |
+| `input_noise.py` | noise of inputs, as errors that are unknowns of each interval |
 | `score_tests.py` | tests of effects that are not in a fit |
 | **parameters and findings** | |
 | `projection.py`, `interval_effects.py` | parameters and covariance; effects of each interval |

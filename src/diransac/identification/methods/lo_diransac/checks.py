@@ -39,6 +39,12 @@ def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | Non
         yield Finding("note", f"Inputs that vary {how} between samples explain this log better than held ones.")
     if acting is None:
         yield from _of_recordings(found.intervals)
+        for (name, unit), std in zip(found.intervals.model.inputs.items(), found.noise_of_inputs, strict=True):
+            if std:
+                size = f"{number(std, 2)} {unit}".strip()
+                yield Finding(
+                    "note", f"{name} is recorded with white noise of {size} (RMS), which the estimate includes."
+                )
     yield from _of_parts(found.intervals.layout.names, parts)
 
 

@@ -23,8 +23,12 @@ _FIRST_DAMPING, _LEAST_DAMPING = 1e-7, 1e-9
 
 
 def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> JointEquations:
-    """Normal equations at a fit, with its own weights unless there are others; see `JointEquations.of`."""
-    return JointEquations.of(intervals, fit, intervals.all_errors.kinds, weights)
+    """Normal equations at a fit, with its own weights unless there are others; see `JointEquations.of`.
+
+    Errors of noisy inputs stay as they are: a delay by a fraction of a sample, or a lag, would average their noise.
+    """
+    kinds = [x for x in intervals.all_errors.kinds if not (intervals.noisy and x.of_inputs)]
+    return JointEquations.of(intervals, fit, kinds, weights)
 
 
 @dataclass(frozen=True)

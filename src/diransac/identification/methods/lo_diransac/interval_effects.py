@@ -22,7 +22,7 @@ _TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EffectOfIntervals:
-    """Change of a fit's parameters by each interval's measurements, to first order.
+    """Change of a fit's parameters by each interval's measurements, of its inputs if these are noisy, to first order.
 
     Parameters
     ----------
@@ -57,6 +57,8 @@ def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfInter
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
     steps = np.einsum("wkp,wk->wp", z, at.data_z) + at.data_s @ s
+    if intervals.noisy:
+        steps -= np.einsum("wep,we->wp", z[:, fit.x.shape[1] :], fit.d / np.square(fit.tau))
     return EffectOfIntervals(steps, s[:n_p], z, s)
 
 

@@ -22,6 +22,14 @@ from diransac.errors import TimeLimitError
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.gauss_newton import linearized
+from diransac.identification.methods.lo_diransac.input_noise import (
+    averaged_noise,
+    explains_all,
+    may_explain,
+    noise_of_inputs,
+    refine_noisy,
+    simpler_timings,
+)
 from diransac.identification.methods.lo_diransac.integration_steps import answer, with_fewest_steps
 from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
@@ -34,7 +42,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import (
     with_errors,
 )
 from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, refine_further, start
-from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG
+from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG, ShootingIntervals
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
@@ -44,7 +52,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
@@ -82,12 +89,19 @@ class Explanation:
         """The logs, with the most probable errors of the recordings."""
         return self.refinement.intervals
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Negative log evidence, with half the logarithm of the number of rows for each scale and each error."""
         intervals = self.intervals
-        n_scales = (0 if self.exact else 2 * intervals.model.n_v + 1) + len(intervals.all_errors.kinds)
-        return self.refinement.cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
+        n_scales = int((self.noise_of_inputs > 0.0).sum()) if self.exact else 2 * intervals.model.n_v + 1
+        n_scales += len(intervals.all_errors.kinds)
+        cost = self.refinement.cost + averaged_noise(intervals, self.refinement.fit)
+        return cost + 0.5 * n_scales * float(np.log(intervals.is_logged.sum()))
+
+    @cached_property
+    def noise_of_inputs(self) -> FloatArray:
+        """Standard deviation ``(n_u,)`` of the noise of each input; 0 where there is none."""
+        return noise_of_inputs(self.intervals, self.refinement.fit)
 
     @cached_property
     def projected(self) -> FloatArray:
@@ -176,7 +190,9 @@ class LocalSearch:
             best = self._accurate(self._simplified(self._moved(best, best.intervals.with_errors(named))))
             yield best
         for k, found in enumerate(self._with_more_errors(best, free_hold=free_hold)):
-            yield self._shown(found, 0.6 + 0.03 * k)
+            best = found
+            yield self._shown(best, 0.6 + 0.03 * k)
+        yield self._shown(self._with_noise(best, free_hold=free_hold), 0.85)
 
     def _ended_by(self, rival: Explanation, flexible: Explanation) -> Explanation | None:
         """Outcome that ends a search beside a rival; None where it may find another explanation as likely.
@@ -206,8 +222,23 @@ class LocalSearch:
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:
                 break
-            best = self._accurate(min(found, key=lambda x: x.cost))
+            best = self._accurate(self._without_superfluous(min(found, key=lambda x: x.cost)))
             yield best
+
+    def _without_superfluous(self, found: Explanation) -> Explanation:
+        """The explanation with a timing of some inputs instead of one of all and another of the others, if it will do.
+
+        That of all inputs is found first where one is late; those that are not then seem early by as much.
+        """
+        intervals, fewer = found.intervals, list[ShootingIntervals]()
+        sizes, sought = intervals.all_errors.sizes, self._sought(found)
+        for common in (x for x in map(intervals.all_inputs, LATE) if x in sizes and x in sought):
+            alone = intervals.without_error(common)
+            for own in (x for x in sizes if x.of_inputs and x.what == common.what and x != common):
+                rest = replace(common, columns=tuple(x for x in common.columns if x not in own.columns))
+                fewer += [alone, alone.without_error(own).with_input_error(rest, sizes[common])]
+        leanest = min((self._moved(found, x) for x in fewer), key=lambda x: x.cost, default=found)
+        return leanest if leanest.cost < found.cost + AS_LIKELY else found
 
     def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation) -> Explanation:
         """The likeliest explanation of a part of some logs, from a fit of that part with the freedom of all.
@@ -259,8 +290,8 @@ class LocalSearch:
     def _sought(self, best: Explanation) -> list[ErrorKind]:
         """Errors of recordings that the settings leave to the evidence.
 
-        Where the model is exact, all inputs, groups of signals and single signals of its measurement equations are
-        tested: nothing else depends on the latter, so that the motion is as likely whatever their delay.
+        Where the model is exact, inputs, groups of signals and single signals of its measurement equations are tested:
+        nothing else depends on the latter, so that the motion is as likely whatever their delay.
         """
         intervals, settings = best.intervals, self.settings
         model, alone = intervals.model, np.full(len(intervals.model.signals), not best.exact)
@@ -271,10 +302,10 @@ class LocalSearch:
         own["drift"] = settings.gain_drifts
 
         def admits(kind: ErrorKind) -> bool:
-            if kind in late:
+            if kind in late and not intervals.noisy:
                 other = settings.input_lag if kind.what == "delay" else settings.input_delay
                 return switches[kind.what] is not False and not other
-            if kind.of_inputs and (best.exact or switches.get(kind.what) is False):
+            if kind.of_inputs and (intervals.noisy or switches.get(kind.what) is False):
                 return False
             return own[kind.what] is None
 
@@ -340,6 +371,8 @@ class LocalSearch:
         """The explanation of other intervals with the same freedom."""
         if not now.exact:
             return replace(now, refinement=refine(self.settings, intervals, begin, self.prior))
+        if intervals.noisy:
+            return replace(now, refinement=refine_noisy(self.settings, intervals, begin, self.prior))
         kept = set(intervals.all_errors.kinds) >= set(now.intervals.all_errors.kinds)
         if kept and intervals.hold == now.intervals.hold:
             return replace(now, refinement=refine_further(self.settings, intervals, begin))
@@ -415,6 +448,40 @@ class LocalSearch:
             return exact
         also = self._exact(intervals.with_errors([late]), begin, flexible) if late in self._sought(exact) else None
         return exact if also is None else min(exact, also, key=lambda x: x.cost)
+
+    def _with_noise(self, found: Explanation, *, free_hold: bool) -> Explanation:
+        """The exact model with noise of its inputs, if that explains the log: better, or where no exact model does.
+
+        Unmodelled accelerations may be more probable than noise that is there: they have the smoothness of the motion.
+        Noise took place if nothing but white noise is left.  Errors of inputs that stood for it are left out: drifts,
+        fractions of samples and lags, which average it.
+        """
+        own = None if found.exact else found.projected
+        if not (self.settings.max_steps and may_explain(found.intervals, found.refinement.fit, self.prior, own)):
+            return found
+        best = self._noisy(found, found.intervals)
+        if not self._named(found.intervals) and (best or found.intervals.all_errors.input_lag.any()):
+            for other in simpler_timings(found.intervals, free_hold=free_hold):
+                noisy = self._noisy(found, other)
+                if noisy and (best is None or noisy.cost < best.cost + AS_LIKELY):
+                    best = noisy
+        return found if best is None or (found.exact and best.cost > found.cost - AS_LIKELY) else best
+
+    def _noisy(self, found: Explanation, intervals: ShootingIntervals) -> Explanation | None:
+        """The exact model with noise of its inputs over intervals; None where it is not noise that is left."""
+        fit, p = found.refinement.fit, found.refinement.fit.shared[: intervals.n_p]
+        p = p if found.exact else found.projected
+        if not intervals.layout.admits(p[None])[0]:
+            return None
+        begin = with_residuals(intervals, replace(fit, shared=np.concatenate([p, fit.shared[intervals.n_p :]])))
+        try:
+            refined = refine_noisy(self.settings, intervals, begin, self.prior)
+            is_noise = explains_all(
+                refined.intervals, refined.fit, self.settings.candidate_terms, instead_of_exact=found.exact
+            )
+        except np.linalg.LinAlgError:
+            return None
+        return replace(found, refinement=refined, exact=True) if is_noise else None
 
     def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: Explanation) -> Explanation | None:
         """The exact model from a motion, with all integration steps: it is one simulation of the whole log.

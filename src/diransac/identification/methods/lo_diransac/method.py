@@ -24,6 +24,7 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
+from diransac.identification.methods.lo_diransac.input_noise import with_accelerations
 from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
@@ -95,7 +96,7 @@ class LoDiransac(LoDiransacSettings):
         clearly.
     max_recording_errors : int, optional
         Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
-        is exact, only this, and those of groups of sensors and of sensors with a measurement equation.
+        is exact, only those of inputs, of groups of sensors, and of sensors with a measurement equation.
     substeps : int, optional
         Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
         One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
@@ -239,7 +240,8 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     parts, candidates, lacks = compared_parts(likeliest, result), None, None
     if settings.suggestions:
         with suppress(np.linalg.LinAlgError):  # squares of tiny or huge numbers, of which no term can be tested
-            candidates = candidates_of_fit(intervals, refined.fit, result, settings.candidate_terms)
+            moved = with_accelerations(intervals, refined.fit, result)
+            candidates = candidates_of_fit(*moved, settings.candidate_terms)
             lacks = None if likeliest.exact else missing_terms(candidates)
     ambiguity = np.zeros((len(result.parameters),) * 2)
     if lacks is not None:
@@ -398,6 +400,7 @@ def _diagnosis(
         accelerations.append(found.lacks.accelerations)
     forces = _forces_of(intervals, fit, result.parameters, accelerations)
     fitted, late = (fit.noise, fit.residuals, fit.x), best.common_timing
+    input_noise = zip(intervals.model.inputs, best.likeliest.noise_of_inputs.tolist(), strict=True)
     return replace(
         diagnosis_of(found.dataset, intervals, fitted, result.unexplained, (lost, combinations)),
         unmodelled_forces=by_acceleration(intervals, forces[0]) if forces else {},
@@ -405,6 +408,7 @@ def _diagnosis(
         input_delay_error=late.std * intervals.dt if late else np.inf,
         input_delay_significant=found.is_late,
         known_up_to=known,
+        input_noise={name: std for name, std in input_noise if std},
         suggested_terms=by_acceleration(intervals, (forces or accelerations)[1]) if len(accelerations) > 1 else {},
     )
 

@@ -272,7 +272,7 @@ def _means(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     """Means ``(W, ...)`` of the rows that count; 0 in intervals without one."""
     weights = _weights_of_rows(intervals)
     weighted = np.where(weights > 0.0, values.T * weights, 0.0).T
-    return np.asarray(weighted.reshape(len(intervals), -1, *values.shape[1:]).sum(axis=1))
+    return np.asarray(weighted.reshape(len(intervals), intervals.length, *values.shape[1:]).sum(axis=1))
 
 
 def _mean_inertia(intervals: ShootingIntervals, M: FloatArray) -> FloatArray:

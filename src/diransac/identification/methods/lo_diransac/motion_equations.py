@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 _TINY = 1e-300
 
 
-def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) -> FloatArray:
+def unexplained(
+    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, *, recorded: bool = False
+) -> FloatArray:
     """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
 
     Parameters
@@ -31,6 +33,8 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
     intervals : ShootingIntervals
     fit : Fit
     parameters : (n,) array
+    recorded : bool, optional
+        With noisy inputs as they were recorded, not as the fit corrects them.
 
     Returns
     -------
@@ -38,7 +42,8 @@ def unexplained(intervals: ShootingIntervals, fit: Fit, parameters: FloatArray) 
         0 where an interval has no row that counts.
     """
     p = _row_parameters(intervals, parameters)
-    residuals, _, M = _residual_map(intervals.model)(*_motion(intervals, fit), p)
+    *motion, inputs = _motion(intervals, fit)
+    residuals, _, M = _residual_map(intervals.model)(*motion, intervals.inputs if recorded else inputs, p)
     left = np.linalg.solve(_matrices(M, intervals.model.n_v), residuals[:, :, None])[:, :, 0]
     logged = intervals.counted[:, None].astype(float)
     return means_of_intervals(intervals, left * logged) / np.maximum(means_of_intervals(intervals, logged), _TINY)
@@ -247,11 +252,16 @@ def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray,
 
 
 def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Fitted coordinates, velocities and accelerations, and the inputs as they act, each (N, n)."""
+    """Fitted coordinates, velocities, accelerations, and the inputs as they act, without noise, each (N, n)."""
     model = intervals.model
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
     q, v, a, _ = split_signals(model, series.reshape(len(intervals.measured), -1))
-    return q, v, a, intervals.inputs
+    return (
+        q,
+        v,
+        a,
+        intervals.inputs + np.repeat(fit.d, intervals.length, axis=0) if intervals.noisy else intervals.inputs,
+    )
 
 
 def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:

@@ -297,7 +297,7 @@ def linearize(
 def variances_of_intervals(
     intervals: ShootingIntervals, fit: Fit, weights: FloatArray, z: FloatArray, s: FloatArray
 ) -> FloatArray:
-    """Variances of functions of a fit by the noise of each interval's measurements alone.
+    """Variances of functions of a fit by the noise of each interval's measurements alone, of inputs if they are noisy.
 
     Parameters
     ----------
@@ -314,7 +314,11 @@ def variances_of_intervals(
     """
     sums = intervals.gauss_newton(fit.shared, fit.x, fit.d, weights)
     own = np.concatenate([z, of_logs(intervals, s)], axis=1)
-    return np.asarray(own.swapaxes(1, 2) @ sums.normal_matrix @ own)
+    found = own.swapaxes(1, 2) @ sums.normal_matrix @ own
+    if intervals.noisy:
+        by_errors = z[:, fit.x.shape[1] :] / fit.tau[:, None]
+        found += by_errors.swapaxes(1, 2) @ by_errors
+    return np.asarray(found)
 
 
 def _places(intervals: ShootingIntervals) -> IntArray:

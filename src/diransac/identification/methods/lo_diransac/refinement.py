@@ -19,8 +19,9 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,7 +46,7 @@ from diransac.identification.methods.lo_diransac.segments import DIVERGED
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
+    from diransac.identification.methods.lo_diransac.gauss_newton import Step
     from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
@@ -90,6 +91,11 @@ class Prior:
     unit: FloatArray
     discrepancy: float
     guarded: float
+
+    @property
+    def exact(self) -> FloatArray:
+        """Size ``(n_v,)`` of unmodelled accelerations that vanish for practical purposes."""
+        return np.asarray(_EXACT * self.tau)
 
 
 @dataclass(frozen=True)
@@ -271,17 +277,23 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     TimeLimitError
         The time limit was reached.
     """
+    return refine_by(settings, intervals, fit, partial(_update, settings, prior))
+
+
+def refine_by(
+    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, update: Callable[[Step], Fit]
+) -> Refinement:
+    """Fit after steps until convergence, with every scale updated after each; arguments and errors as `refine`."""
     damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
     del fit
     while steps < settings.max_steps and not converged:
         check_time()
         steps += 1
         taken = gauss_newton_step(at, damping)
-        intervals, solved, damping = taken.intervals, taken.solved, taken.damping
-        updated = _update(settings, intervals, taken.fit, solved, prior)
-        errors = np.sqrt(np.diag(solved.var_p)[: intervals.n_p])
+        intervals, damping, updated = taken.intervals, taken.damping, update(taken)
+        errors = np.sqrt(np.diag(taken.solved.var_p)[: intervals.n_p])
         converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors)
-        del at, taken, solved  # the next equations take as much memory
+        del at, taken  # the next equations take as much memory
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
@@ -314,7 +326,7 @@ def refine_exact(
     shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _EXACT * prior.guarded * prior.unit[intervals.n_p :]
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
-    return _tightened(settings, intervals, fit, _EXACT * prior.tau, rival)
+    return _tightened(settings, intervals, fit, prior.exact, rival)
 
 
 def refine_further(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit) -> Refinement:
@@ -424,10 +436,9 @@ def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float
     return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
 
 
-def _update(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, solved: Factored, prior: Prior
-) -> Fit:
-    """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
+def _update(settings: LoDiransacSettings, prior: Prior, taken: Step) -> Fit:
+    """The fit after a step with every scale updated from residuals, unmodelled accelerations and discrepancies."""
+    intervals, fit, solved = taken.intervals, taken.fit, taken.solved
     noise = fit.noise.updated(fit.residuals, intervals.known, outliers=settings.outliers)
     sums = process_sums(intervals, fit, solved).total()
     tau, rho = sums.most_probable_size(prior.tau, fit.tau), sums.correlation(prior.tau)

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 SHRINK = 0.4
 """Largest change of any scale in a step."""
 
-# Continuity is exact for practical purposes: jumps are as small a part of the effect of tau in an interval.
-_CONTINUITY = 0.03
+CONTINUITY = 0.03
+"""Jumps over the effect of tau in an interval: as small a part of it is exact for practical purposes."""
+
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
@@ -189,7 +190,7 @@ def negligible_jumps(intervals: ShootingIntervals, tau: FloatArray) -> FloatArra
     -------
     (n_x,) array
     """
-    return _CONTINUITY * effect_on_state(intervals, tau)
+    return CONTINUITY * effect_on_state(intervals, tau)
 
 
 def effect_on_state(intervals: ShootingIntervals, acceleration: FloatArray) -> FloatArray:

@@ -99,7 +99,8 @@ class Searched:
         kinds = [x for x in map(intervals.all_inputs, LATE) if x in sizes]
         found = errors_of(intervals, fit, kinds or [intervals.all_inputs("delay")])
         whole = sum(sizes[x] for x in kinds)
-        return replace(found[0], size=whole + found[0].size) if found else None
+        left = 0.0 if intervals.noisy else found[0].size if found else 0.0  # the noise of a sample would move it
+        return replace(found[0], size=whole + left) if found else None
 
     @property
     def is_late(self) -> bool:

@@ -67,6 +67,8 @@ class ShootingIntervals:
         Threads of the simulations with derivatives.
     discrepancies : bool, optional
         Whether the model is augmented by input gain and bias discrepancies.
+    noisy : bool, optional
+        Whether the unknowns of an interval are errors of the inputs instead of unmodelled accelerations.
     """
 
     model: Model
@@ -84,6 +86,7 @@ class ShootingIntervals:
     errors: RecordingErrors | None = None
     threads: int = 1
     discrepancies: bool = True
+    noisy: bool = False
 
     @classmethod
     def of(
@@ -191,7 +194,7 @@ class ShootingIntervals:
     @cached_property
     def augmented(self) -> AugmentedModel:
         """The model with its discrepancies."""
-        return augmented_model(self.model, discrepancies=self.discrepancies)
+        return augmented_model(self.model, discrepancies=self.discrepancies, noisy=self.noisy)
 
     @property
     def n_p(self) -> int:
