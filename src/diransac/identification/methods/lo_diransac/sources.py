@@ -210,10 +210,11 @@ def _within_bounds(gram: FloatArray, unit: FloatArray, bounds: Sequence[Paramete
 
 
 def _nonlinear(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray, FloatArray]:
-    """Least squares of the accelerations, of all rows and without each block."""
+    """Least squares of the accelerations, of all rows and without each block; of an affine model from `_ordinary`."""
     from diransac.identification.regression.nonlinear import NonlinearLeastSquares
 
-    bound = NonlinearLeastSquares().bind(own)
+    method = NonlinearLeastSquares(n_starts=1, n_followed=0) if own.model.is_affine else NonlinearLeastSquares()
+    bound = method.bind(own)
     rows = np.arange(0, bound.n_rows, max(1, bound.n_rows // _MOST_ROWS))
     found = bound.fit_from(rows, bound.of_all_rows)
     groups = [np.flatnonzero(block[rows] == k) for k in range(n_blocks)]
