@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
@@ -13,7 +13,7 @@ from diransac.data.filters import median_filter
 _FEWEST = 5
 # Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
 _SPIKE_WINDOW, _SPIKE_PASSES = 5, 20
-# Relative change of a signal that is a rounding error; steps of its resolution that are fewer than two.
+# Relative change of a signal that is a rounding error; a leap over the step that follows, where it is fewer than two.
 _ROUNDING, _ONE_STEP = 1e-9, 1.5
 
 
@@ -35,10 +35,11 @@ def odd_window(seconds: float, dt: float, most: int) -> int:
 
 
 def stuck_rows(measured: FloatArray) -> BoolArray:
-    """Rows that repeat the previous row exactly in every signal: nothing new was measured.
+    """Rows that repeat the previous row exactly in every signal, and are no standing still: nothing new was measured.
 
-    Signals of a coarse resolution repeat by themselves while they move slowly, and change by one step then; rows
-    are not stuck where each signal does.
+    A signal whose noise exceeds its resolution never repeats while it is measured.  Signals of a coarse resolution
+    repeat at rest.  Rows are at rest if motion then begins from rest in each signal, with a step that is no larger than
+    the one that follows or two of its resolution; a recorder that was stuck catches up.
 
     Parameters
     ----------
@@ -52,16 +53,37 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
     if not stuck.any():
         return stuck
+    resolution = _resolutions(measured)
+    if (_noise(measured[~stuck]) > resolution).any():
+        return stuck
+    # Of each row, the next one that is not stuck, and the one after it; the last row moves as if from rest.
+    following = _next(~stuck, n)
+    after = np.minimum(following + 1, n - 1)
+    leaps = np.abs(measured[following] - measured)
+    steps = np.abs(measured[after] - measured[following])
+    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * np.maximum(resolution, steps), axis=1))
+
+
+def _next(free: BoolArray, n: int) -> IntArray:
+    """Next row ``(n,)`` after each that is free; the last row where there is none."""
+    rows = np.where(free, np.arange(n), n - 1)
+    return np.asarray(np.minimum.accumulate(np.append(rows[1:], n - 1)[::-1])[::-1])
+
+
+def _resolutions(measured: FloatArray) -> FloatArray:
+    """Smallest step ``(n,)`` of each signal that is no rounding error; infinite for a constant one."""
     changes = np.abs(np.diff(measured, axis=0))
     least = _ROUNDING * np.nan_to_num(np.abs(measured)).max(axis=0)
-    resolution = np.where(changes > least, changes, np.inf).min(axis=0)
-    # Of each row, the next one that is not stuck.
-    free = np.where(stuck, n, np.arange(n))
-    following = np.append(np.minimum.accumulate(free[::-1])[::-1], n)[1:]
-    leaps = np.full(measured.shape, np.inf)
-    ends = following < n
-    leaps[ends] = np.abs(measured[following[ends]] - measured[ends])
-    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1))
+    return np.asarray(np.where(changes > least, changes, np.inf).min(axis=0))
+
+
+def _noise(measured: FloatArray) -> FloatArray:
+    """Standard deviation ``(n,)`` of the noise of signals, from differences of fourth order, in which motion is small.
+
+    0 where it is less than half of the rows that differ: quantisation alone.
+    """
+    fourth = np.diff(measured, 4, axis=0)
+    return np.asarray(robust_std(fourth[np.isfinite(fourth).all(axis=1)], axis=0)) / np.sqrt(70.0)
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
