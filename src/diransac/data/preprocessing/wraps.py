@@ -14,7 +14,7 @@ from diransac.data.filters import median_filter
 COUNTER_BITS = (8, 12, 16, 24, 32)
 """Bits of counters of encoders and timers."""
 # Samples of the running median that takes out outliers, and of those on either side of a leap that give its rate.
-_WINDOW, _BESIDE = 5, 12
+_WINDOW, _BESIDE = 3, 12
 # Shares of the range: of a leap at least, and of any other step at most.
 _LEAP, _STEP = 0.6, 0.25
 # Shares of the steps that may be larger, beside outliers, and of the leaps that are wraps at least.
@@ -44,7 +44,7 @@ def wrap_period(values: FloatArray, turns: tuple[float, ...] = ()) -> float | No
         which there are several.
     """
     known = values[np.isfinite(values)]
-    if len(known) < 4 * _BESIDE:
+    if len(known) < 4 * _BESIDE or np.abs(np.diff(known)).max() < _STEP * np.ptp(known):
         return None
     usual_values = median_filter(known, _WINDOW)
     span = float(np.ptp(usual_values))
@@ -92,7 +92,7 @@ def _goes_on(leaps: FloatArray, rates: FloatArray, least: float) -> bool:
     sizes = np.abs(rates)
     fast = sizes.min(axis=1) > np.maximum(0.25 * sizes.max(axis=1), least)
     against = (np.sign(rates) == -np.sign(leaps)[:, None]).all(axis=1)
-    return bool(fast.any() and against[fast].all())
+    return bool(fast.any() and against[fast].mean() >= _MOST)
 
 
 def _resolution(values: FloatArray) -> float:

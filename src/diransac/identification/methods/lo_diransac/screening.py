@@ -78,12 +78,11 @@ def _resolutions(measured: FloatArray) -> FloatArray:
 
 
 def _noise(measured: FloatArray) -> FloatArray:
-    """Standard deviation ``(n,)`` of the noise of signals, from differences of fourth order, in which motion is small.
-
-    0 where it is less than half of the rows that differ: quantisation alone.
-    """
+    """Standard deviation ``(n,)`` of the noise of signals by differences of fourth order, in which motion is small."""
     fourth = np.diff(measured, 4, axis=0)
-    return np.asarray(robust_std(fourth[np.isfinite(fourth).all(axis=1)], axis=0)) / np.sqrt(70.0)
+    fourth = fourth[np.isfinite(fourth).all(axis=1)]
+    # The variance of a difference of fourth order is 1 + 16 + 36 + 16 + 1 times that of a sample.
+    return np.asarray(robust_std(fourth, axis=0) / np.sqrt(70.0) if len(fourth) else np.zeros(measured.shape[1]))
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
