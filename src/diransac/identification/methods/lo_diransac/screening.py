@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, robust_std, runs
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
@@ -15,6 +15,9 @@ _FEWEST = 5
 _SPIKE_WINDOW, _SPIKE_PASSES = 5, 20
 # Relative change of a signal that is a rounding error; a leap over the step that follows, where it is fewer than two.
 _ROUNDING, _ONE_STEP = 1e-9, 1.5
+# Probability of chance at which rows are stuck; standard deviations of noise that a leap may have.
+_CHANCE, _SIGMAS = 1e-3, 3.0
+_TINY = 1e-300
 
 
 def odd_window(seconds: float, dt: float, most: int) -> int:
@@ -37,9 +40,10 @@ def odd_window(seconds: float, dt: float, most: int) -> int:
 def stuck_rows(measured: FloatArray) -> BoolArray:
     """Rows that repeat the previous row exactly in every signal, and are no standing still: nothing new was measured.
 
-    A signal whose noise exceeds its resolution never repeats while it is measured.  Signals of a coarse resolution
-    repeat at rest.  Rows are at rest if motion then begins from rest in each signal, with a step that is no larger than
-    the one that follows or two of its resolution; a recorder that was stuck catches up.
+    Rows that repeat more often than the noise of the signals, in steps of their resolution, lets them by chance are
+    stuck.  Signals of a coarse resolution repeat at rest.  Rows are at rest if motion then begins from rest in each
+    signal, with a step that is no larger than the one that follows, or one of its resolution, within the noise; a
+    recorder that was stuck catches up.
 
     Parameters
     ----------
@@ -49,25 +53,22 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     -------
     (N,) bool array
     """
-    n, stuck = len(measured), np.zeros(len(measured), bool)
-    stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
-    if not stuck.any():
-        return stuck
-    resolution = _resolutions(measured)
-    if (_noise(measured[~stuck]) > resolution).any():
-        return stuck
-    # Of each row, the next one that is not stuck, and the one after it; the last row moves as if from rest.
-    following = _next(~stuck, n)
-    after = np.minimum(following + 1, n - 1)
+    n, repeated = len(measured), np.zeros(len(measured), bool)
+    repeated[1:] = np.all(measured[1:] == measured[:-1], axis=1)
+    if not repeated.any():
+        return repeated
+    resolution, noise = _resolutions(measured), _noise(measured[~repeated])
+    # Probability that two samples with noise above the resolution are equal, of all signals; and of runs of them.
+    chances = resolution / np.maximum(2.0 * np.sqrt(np.pi) * noise, _TINY)
+    equal = np.where(noise > resolution, chances, 1.0).prod()
+    stuck, following = np.zeros(n, bool), np.zeros(n, int)
+    for run in runs(repeated):
+        stuck[run] = n * equal ** (run.stop - run.start) < _CHANCE
+        following[run] = min(run.stop, n - 1)
     leaps = np.abs(measured[following] - measured)
-    steps = np.abs(measured[after] - measured[following])
-    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * np.maximum(resolution, steps), axis=1))
-
-
-def _next(free: BoolArray, n: int) -> IntArray:
-    """Next row ``(n,)`` after each that is free; the last row where there is none."""
-    rows = np.where(free, np.arange(n), n - 1)
-    return np.asarray(np.minimum.accumulate(np.append(rows[1:], n - 1)[::-1])[::-1])
+    steps = np.abs(measured[np.minimum(following + 1, n - 1)] - measured[following])
+    at_rest = np.all(leaps < _ONE_STEP * np.maximum(resolution, steps) + _SIGMAS * noise, axis=1)
+    return np.asarray(repeated & (stuck | ~at_rest))
 
 
 def _resolutions(measured: FloatArray) -> FloatArray:
