@@ -231,7 +231,7 @@ def _option(option: str, *names: str, value: str) -> str:
 
 
 def mistakes() -> Iterator[Case]:
-    """Forty planted mistakes."""
+    """Planted mistakes."""
     deg, mm, cm, back = r"0\.01745", r"0\.001\b", r"0\.01\b", r"-1\b"
     for one, q in ((TURRET, "yaw"), (GANTRY, "sway"), (SCARA, "q2"), (BEAM, "tilt")):
         yield Case(f"{one.model.name} {q} deg", one, _option("scale", q, value=deg), scaled(**{q: 1.0 / DEGREE}))

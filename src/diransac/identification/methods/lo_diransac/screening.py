@@ -16,7 +16,7 @@ _SPIKE_WINDOW, _SPIKE_PASSES = 5, 20
 # Relative change of a signal that is a rounding error; a leap over the step that follows, where it is fewer than two.
 _ROUNDING, _ONE_STEP = 1e-9, 1.5
 # Probability of chance at which rows are stuck; standard deviations of noise that a leap may have.
-_CHANCE, _SIGMAS = 1e-3, 3.0
+_CHANCE, _SIGMAS = 0.01, 3.0
 _TINY = 1e-300
 
 
