@@ -389,7 +389,7 @@ class _Task:
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
 
 
-def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
+def _mistakes(dataset: Dataset, *, delays: bool = True) -> tuple[list[Mistake], int]:
     """Mistakes of columns that explain the logs, and the number of those tested; none without equations."""
     if not dataset.model.has_equations:
         return [], 0
@@ -397,10 +397,10 @@ def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
 
     def found() -> tuple[list[Mistake], int]:
         with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-            return mistakes_of_columns(dataset, solved_nonlinear)
+            return mistakes_of_columns(dataset, solved_nonlinear, delays=delays)
 
     try:
-        return dataset.kept("mistakes of columns", found)
+        return dataset.kept(("mistakes of columns", delays), found)
     except TimeLimitError:
         return [], 0
 
@@ -434,7 +434,7 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     # A quarter of an acceleration that is unexplained is a reason to test columns.
     is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25 or result.verdict != "usable"
     if is_doubtful:
-        mistakes, n_tested = _mistakes(dataset)
+        mistakes, n_tested = _mistakes(dataset, delays=not result.separates_forces)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
     found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]

@@ -163,12 +163,15 @@ class CorrectionTests:
     rows : sequence of MotionRows
     nonlinear : callable
         Solution of a model that is not affine in its parameters, as `solved`.
+    delays : bool, optional
+        Whether delays of inputs are tested, which an estimate may include.
     """
 
     model: Model
     layout: ParameterLayout
     rows: Sequence[MotionRows]
     nonlinear: Solver
+    delays: bool = True
 
     @cached_property
     def _some(self) -> list[tuple[IntArray, BoolArray]]:
@@ -280,7 +283,9 @@ def explained(tests: CorrectionTests) -> tuple[list[CorrectedEquations], int]:
     assert without is not None
     tested = [x for one in corrections(tests.model) if (x := tests.of(one)) is not None]
     found = _best(tests, without, [*tested, *_several_signs(tests, without)])
-    return found or _best(tests, without, list(_delays(tests, without))), len(tested)
+    if not found and tests.delays:
+        found = _best(tests, without, list(_delays(tests, without)))
+    return found, len(tested)
 
 
 def _best(

@@ -87,7 +87,7 @@ def _scaled(names: Iterable[str], factor: float) -> str:
     return _again("scale", dict.fromkeys(names, f"{factor:.6g}"))
 
 
-def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mistake], int]:
+def mistakes_of_columns(dataset: Dataset, nonlinear: Solver, *, delays: bool = True) -> tuple[list[Mistake], int]:
     """Mistakes that explain a bad answer, the clearest first, and the number of corrections that were tested.
 
     Parameters
@@ -95,6 +95,8 @@ def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mista
     dataset : Dataset
     nonlinear : callable
         Solution of a model that is not affine in its parameters, as `solved`.
+    delays : bool, optional
+        Whether delays of inputs are tested, which an estimate may include.
     """
     found = contradictions(dataset.model, dataset.given) or _zero_inputs(dataset)
     if found:
@@ -105,14 +107,14 @@ def mistakes_of_columns(dataset: Dataset, nonlinear: Solver) -> tuple[list[Mista
         complete = all(set(model.required_signals) <= set(log.signals) for log in parts)
         logs = parts if complete else [differentiate(log, model) for log in parts]
         other = Dataset.of(model, logs, pointwise=True)
-        return explanations(CorrectionTests(model, other.layout, motion_rows(other), nonlinear), dataset.given)
+        return explanations(CorrectionTests(model, other.layout, motion_rows(other), nonlinear, delays), dataset.given)
     except TimeLimitError:
         raise
     except (DiransacError, np.linalg.LinAlgError):
         rows = dataset.kept(FITTED_MOTION, list[MotionRows])
         if not rows:
             return [], 0  # the equations cannot be evaluated on the logs
-        return explanations(CorrectionTests(dataset.model, dataset.layout, rows, nonlinear), dataset.given)
+        return explanations(CorrectionTests(dataset.model, dataset.layout, rows, nonlinear, delays), dataset.given)
 
 
 def explanations(tests: CorrectionTests, logs: Sequence[Log]) -> tuple[list[Mistake], int]:
