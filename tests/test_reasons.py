@@ -11,6 +11,7 @@ import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import motion_rows, solved
+from diransac.identification.structure.column_corrections import Correction, CorrectionTests
 from diransac.identification.structure.columns import contradictions, explanations, mistakes_of_columns
 from regime_logs import of_table, recorded
 from simulated import MACHINES, as_log, flight
@@ -57,21 +58,17 @@ def test_columns_without_a_mistake_are_not_accused(name):
         assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
 
 
-@pytest.mark.parametrize("noisy", [False, True])
-def test_equations_that_leave_most_of_their_terms_accuse_no_sign(noisy):
+@pytest.mark.parametrize("noise", [0.0, 30.0])
+def test_equations_that_leave_most_of_their_terms_accuse_no_sign(noise):
     """Least squares of noise has parameters of any sign, and small errors."""
     machine = MACHINES["planar-rotorcraft"]
     signals, inputs = flight(machine, 1000, 0.01)
     log = as_log(machine, signals, inputs * [-1.0, 1.0], 0.01)
     dataset = Dataset.of(dr.models.planar_rotorcraft(), log, pointwise=True)
-
-    def solve(*arguments):
-        found = solved(*arguments)
-        return replace(found, residuals=np.maximum(found.residuals, 0.9 * noisy))
-
-    with np.errstate(all="ignore"):
-        found, _ = explanations(dataset.model, dataset.layout, motion_rows(dataset), dataset.given, solve)
-    assert [x.claim.split(":")[0] for x in found] == ([] if noisy else ["The sign of thrust is reversed"])
+    (rows,) = motion_rows(dataset)
+    noisy = replace(rows, a=rows.a + noise * np.random.default_rng(0).standard_normal(rows.a.shape))
+    found, _ = explanations(CorrectionTests(dataset.model, dataset.layout, [noisy], solved_nonlinear), dataset.given)
+    assert [x.what for x in found] == ([] if noise else ["The sign of thrust is reversed"])
 
 
 def test_a_mass_that_changes_is_no_wrong_unit():
@@ -90,7 +87,6 @@ def test_a_unit_is_that_of_the_column_by_the_ratio_of_both(low, outliers):
     columns = {n: np.where(rng.random(1000) < outliers, rng.uniform(-50.0, 50.0, 1000), x) for n, x in columns.items()}
     columns[low] = np.degrees(columns[low])
     (found,) = contradictions(model, [dr.Log.from_arrays(t, columns)])
-    assert found.factors == pytest.approx({low: np.pi / 180.0})
     assert found.action == f"identify again with --scale {low}=0.0174533"
 
 
@@ -116,7 +112,9 @@ def test_a_unit_that_parameters_take_up_changes_no_residual():
     dataset = Dataset.of(dr.models.planar_rotorcraft(), as_log(machine, spoilt, inputs, 0.01), pointwise=True)
     rows, every = motion_rows(dataset), tuple(dataset.model.inputs)
     found = solved(dataset.model, dataset.layout, rows)
-    other = solved(dataset.model, dataset.layout, [x.corrected(dataset.model, every, 1000.0, 0.0) for x in rows])
+    other = solved(
+        dataset.model, dataset.layout, [Correction(every, factor=1000.0).of_rows(dataset.model, x) for x in rows]
+    )
     np.testing.assert_allclose(other.residuals, found.residuals, rtol=0.02)
     np.testing.assert_allclose(other.parameters, found.parameters * [1000.0, 1000.0, 1.0], rtol=0.02)
     assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []

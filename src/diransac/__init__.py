@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         resample,
         scale,
         shift,
+        unwrap,
     )
     from diransac.data.readers import read_log, read_logs, read_topics
     from diransac.flight.closed_loop import fly, fly_batch, tracking_error
@@ -154,6 +155,7 @@ __all__ = [
     "tracking_error",
     "tvlqr",
     "tvlqr_batch",
+    "unwrap",
     "validate",
     "write_report",
 ]
@@ -170,6 +172,7 @@ _FOUND_IN = {
         "resample",
         "scale",
         "shift",
+        "unwrap",
     ),
     "data.readers": ("read_log", "read_logs", "read_topics"),
     "flight.closed_loop": ("fly", "fly_batch", "tracking_error"),

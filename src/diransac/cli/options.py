@@ -283,6 +283,9 @@ class Preparation:
         str | None,
         _option("--leave-out", metavar="S:S,...", help="Leave out stretches of time, from start to end: 4.8:5.9."),
     ] = None
+    unwrap: Annotated[
+        list[str] | None, _option(metavar="NAME=PERIOD,...", help="Counters that wrap: ticks=65536, in their unit.")
+    ] = None
     despike: Annotated[str | None, _option(metavar="all|NAME,...", help="Signals to take spikes out of.")] = None
     shift: Annotated[
         list[str] | None, _option(metavar="NAME=S,...", help="Signals to move later in time: thrust=0.02.")
@@ -331,7 +334,7 @@ class Preparation:
 
     def _arguments(self, like: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """Arguments of `read_log`."""
-        replaced = {"despike": self.despike, "shift": self.shift}
+        replaced = {"unwrap": self.unwrap, "despike": self.despike, "shift": self.shift}
         return {
             "mapping": self.mapping,
             "columns": None if self.columns is None else names(self.columns),
@@ -353,6 +356,7 @@ class Preparation:
                 "until": self.stop,
                 "while": None if self.events is None else names(self.events),
                 "leave_out": None if self.left_out is None else _stretches(self.left_out),
+                "unwrap": numbers("--unwrap", self.unwrap or ()),
                 "despike": None if self.despike is None else names(self.despike),
                 "shift": numbers("--shift", self.shift or ()),
             },

@@ -177,8 +177,8 @@ class LogMapping:
     time_column : str, optional
         Column of the time of a table, times ``time_scale`` in seconds.
     preparation : mapping
-        ``resample``, ``repair``, ``from``, ``until``, ``while``, ``despike``, ``shift``, which `read_log` does, and
-        ``differentiate``, ``bandwidth``, which the command line does.
+        ``resample``, ``repair``, ``from``, ``until``, ``while``, ``unwrap``, ``despike``, ``shift``, which `read_log`
+        does, and ``differentiate``, ``bandwidth``, which the command line does.
     text : str
         The file, in TOML.
     """

@@ -144,6 +144,7 @@ class _Mapping(_Form):
     start: _Number | None = Field(None, alias="from")
     until: _Number | None = None
     events_held: _Texts | None = Field(None, alias="while")
+    unwrap: dict[str, _Number] | None = Field(None, description="write a table of periods: unwrap = { ticks = 65536 }")
     despike: _Texts | None = None
     shift: dict[str, _Number] | None = Field(None, description="write a table of seconds: shift = { thrust = 0.02 }")
     differentiate: bool | None = None
@@ -192,7 +193,7 @@ def parse_mapping(text: str, source: str) -> LogMapping:
     form = _Mapping.read(content, source)
     if not form.signals:
         raise LogError(f"{source}: it maps no signal; write [[signals]] with name, topic and field")
-    steps = {"resample", "repair", "from", "until", "while", "despike", "shift", "differentiate", "bandwidth"}
+    steps = {"resample", "repair", "from", "until", "while", "unwrap", "despike", "shift", "differentiate", "bandwidth"}
     loaded = LogMapping(
         source,
         tuple(_signals(x, f"{source}: signal {k + 1}") for k, x in enumerate(form.signals)),

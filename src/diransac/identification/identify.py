@@ -22,7 +22,7 @@ from diransac.identification.method import Callback, Method, fit, numerical_fail
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
 from diransac.identification.result import Result
 from diransac.identification.settings import Settings
-from diransac.identification.structure.columns import Mistake, contradictions, mistakes_of_columns
+from diransac.identification.structure.columns import Mistake, contradictions, mistakes_of_columns, wraps
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.lacking_terms import with_terms
 from diransac.identification.structure.refusal import check_motion
@@ -258,9 +258,11 @@ class Identification:
 
 
 def _moving_dataset(*arguments: Any, **options: Any) -> Dataset:
-    """`Dataset.of` these arguments.  Raises IdentificationError: nothing moves in the logs."""
+    """`Dataset.of` these arguments.  Raises IdentificationError: nothing moves in the logs, or a counter wraps."""
     dataset = Dataset.of(*arguments, **options)
     check_motion(dataset)
+    if mistakes := wraps(dataset.model, dataset.given):
+        raise IdentificationError(f"{dataset.source}: {'; '.join(f'{x.claim}; {x.action}' for x in mistakes)}")
     return dataset
 
 
@@ -387,7 +389,7 @@ class _Task:
         return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
 
 
-def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
+def _mistakes(dataset: Dataset, *, delays: bool = True) -> tuple[list[Mistake], int]:
     """Mistakes of columns that explain the logs, and the number of those tested; none without equations."""
     if not dataset.model.has_equations:
         return [], 0
@@ -395,10 +397,10 @@ def _mistakes(dataset: Dataset) -> tuple[list[Mistake], int]:
 
     def found() -> tuple[list[Mistake], int]:
         with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-            return mistakes_of_columns(dataset, solved_nonlinear)
+            return mistakes_of_columns(dataset, solved_nonlinear, delays=delays)
 
     try:
-        return dataset.kept("mistakes of columns", found)
+        return dataset.kept(("mistakes of columns", delays), found)
     except TimeLimitError:
         return [], 0
 
@@ -430,9 +432,9 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     intervals = result.structural_intervals() if tested else result.intervals()
     lost = [n for n, (low, high) in intervals.items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
     # A quarter of an acceleration that is unexplained is a reason to test columns.
-    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25
+    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25 or result.verdict != "usable"
     if is_doubtful:
-        mistakes, n_tested = _mistakes(dataset)
+        mistakes, n_tested = _mistakes(dataset, delays=not result.separates_forces)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
     found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]

@@ -27,7 +27,7 @@ _Text = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00\n\
 _Stretch = Annotated[list[_Number], Field(min_length=2, max_length=2)]
 _READING = ["mapping", "columns", "rate", "repair", "map", "scale", "resample", "unmeasured", "episodes"]
 _ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base"]
-_STEPS = ["from", "until", "while", "leave-out", "despike", "shift"]
+_STEPS = ["from", "until", "while", "leave-out", "unwrap", "despike", "shift"]
 _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
     *("with-suggestions", "add-terms", "time-limit", "differentiate", "bandwidth"),
@@ -63,6 +63,7 @@ class Project(BaseModel):
     until: _Number | None = None
     while_: list[_Text] | None = None
     leave_out: list[_Stretch] = []
+    unwrap: dict[_Text, _Number] = {}
     despike: list[_Text] | None = None
     shift: dict[_Text, _Number] = {}
     unknown: list[_Text] | None = None

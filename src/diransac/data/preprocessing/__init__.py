@@ -8,6 +8,7 @@ Each step adds one mapping to ``Log.history`` and, where it changes samples, a s
 | `differentiation.py` | velocities and accelerations, and rows filtered against their noise |
 | `spikes.py` | `despike`, by running medians |
 | `continuity.py` | angles without wraps, quaternions without changes of sign |
+| `wraps.py` | periods of counters that wrap |
 """
 
 from diransac.data.preprocessing.continuity import continuous, continuous_quaternions, unwrap
@@ -24,6 +25,7 @@ from diransac.data.preprocessing.steps import (
     shift,
     unit_factors,
 )
+from diransac.data.preprocessing.wraps import wrap_period
 
 __all__ = [
     "acting_inputs",
@@ -44,4 +46,5 @@ __all__ = [
     "shift",
     "unit_factors",
     "unwrap",
+    "wrap_period",
 ]

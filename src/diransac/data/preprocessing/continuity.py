@@ -14,7 +14,9 @@ sign).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,9 +24,10 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, size_or
 from diransac.data.checks import ROUNDING
 from diransac.data.filters import median_filter, mirrored_windows
 from diransac.data.units import one_turn
+from diransac.errors import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Mapping, Sequence
+    from collections.abc import Callable, Container, Sequence
 
     from diransac.data.log import Log
     from diransac.model import Model
@@ -38,6 +41,7 @@ _MARGIN, _MUCH_MOTION = 0.02, 3.0
 _USUAL_MIDDLES = (0.0, 0.5)
 _OWN_NORM = 0.1
 """Relative deviation of a quaternion's norm that is its own."""
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def continuous(log: Log, model: Model) -> Log:
@@ -120,39 +124,48 @@ def _quaternions_of(signals: Mapping[str, FloatArray]) -> list[list[str]]:
 # ---------------------------------------------------------------------- angles
 
 
-def unwrap(log: Log, names: Sequence[str] | None = None) -> Log:
-    """Log with the leaps by one turn removed from wrapped angles.
+def unwrap(log: Log, names: Sequence[str] | Mapping[str, float] | None = None) -> Log:
+    """Log with the leaps by one turn removed from wrapped angles, or by one period from counters.
 
     Parameters
     ----------
     log : Log
-    names : sequence of str, optional
-        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.  None: the signals whose unit is one of angles.
+    names : sequence of str, or mapping of str to float, optional
+        Angles; the turn is 360 for a signal in degrees, 2 pi otherwise.  A mapping gives the period of each, in its
+        unit, such as 65536 ticks.  None: the signals whose unit is one of angles.
 
     Raises
     ------
     LogError
         There is no such signal.
+    SettingsError
+        A period is not positive.
 
     Notes
     -----
     A leap is a wrap if it is one turn to within the motion from sample to sample and a tenth of a turn, also across
     missing samples, and if the signal lies within one turn.  Outliers keep their distance from the angle.
     """
+    if isinstance(names, Mapping):
+        for name, period in names.items():
+            if not 0.0 < period < math.inf:
+                raise SettingsError(f'the period of "{name}" is {period}; give a positive number, in its unit')
+        return _without_wraps(log, names, {"periods": {n: float(x) for n, x in names.items()}})
     turns = {name: one_turn(log.units.get(name, "1")) for name in (log.names if names is None else names)}
     return _without_wraps(log, {n: x or 2.0 * math.pi for n, x in turns.items() if x or names is not None})
 
 
-def _without_wraps(log: Log, turns: Mapping[str, float]) -> Log:
-    """Log with its wrapped ones among the named angles unwrapped; name -> one turn, in the signal's unit."""
+def _without_wraps(log: Log, turns: Mapping[str, float], given: Mapping[str, Any] = _NOTHING) -> Log:
+    """Log with its wrapped ones among the named columns unwrapped; name -> one turn, in the signal's unit."""
     found = {name: _revolutions(log[name], turn) for name, turn in turns.items()}
     wrapped = {name: k for name, k in found.items() if k.any()}
     if not wrapped:
         return log
     signals = {**log.signals, **{name: log[name] + turns[name] * k for name, k in wrapped.items()}}
     leaps = {name: int((np.diff(k) != 0).sum()) for name, k in wrapped.items()}
-    notes = [f'"{name}" was wrapped to one turn; {n} jumps are removed' for name, n in leaps.items()]
-    return log.with_step({"step": "unwrap", "jumps": leaps}, signals=signals, notes=notes)
+    what = {name: f"a period of {turns[name]:.6g}" if given else "one turn" for name in leaps}
+    notes = [f'"{name}" was wrapped to {what[name]}; {n} jumps are removed' for name, n in leaps.items()]
+    return log.with_step({"step": "unwrap", "jumps": leaps, **given}, signals=signals, notes=notes)
 
 
 def _revolutions(values: FloatArray, turn: float) -> IntArray:

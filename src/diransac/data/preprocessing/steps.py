@@ -12,7 +12,7 @@ import numpy.typing as npt
 from diransac.arrays import FloatArray, runs
 from diransac.data.checks import ROUNDING, is_implausible
 from diransac.data.clock import Aligned
-from diransac.data.preprocessing.continuity import interpolated
+from diransac.data.preprocessing.continuity import interpolated, unwrap
 from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
@@ -226,8 +226,8 @@ def prepared(log: Log, steps: Mapping[str, Any]) -> Log:
     ----------
     log : Log
     steps : mapping of str to object
-        In this order: ``from`` and ``until`` (s), ``while`` (events), ``leave_out`` (stretches), ``despike`` (signals,
-        or ``"all"``) and ``shift`` (delays by signal); None is none.
+        In this order: ``from`` and ``until`` (s), ``while`` (events), ``leave_out`` (stretches), ``unwrap``
+        (periods by signal), ``despike`` (signals, or ``"all"``) and ``shift`` (delays by signal); None is none.
 
     Raises
     ------
@@ -240,6 +240,7 @@ def prepared(log: Log, steps: Mapping[str, Any]) -> Log:
         log = log.between(found.get("from", -math.inf), found.get("until", math.inf))
     log = keep_while(log, named["while"]) if "while" in named else log
     log = leave_out(log, found["leave_out"]) if "leave_out" in found else log
+    log = unwrap(log, found["unwrap"]) if found.get("unwrap") else log
     log = despike(log, None if named["despike"] == ["all"] else named["despike"]) if "despike" in named else log
     return shift(log, found["shift"]) if found.get("shift") else log
 

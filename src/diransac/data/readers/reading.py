@@ -40,7 +40,7 @@ class Reading:
     scale, units : mapping of str to float, mapping of str to str
         Factors, and the units of the columns that had them.
     resample : float or str, optional
-    shift : mapping of str to float
+    unwrap, shift : mapping of str to float
     despike : tuple of str
     unmeasured : iterable of str, optional
     """
@@ -53,6 +53,7 @@ class Reading:
     scale: Mapping[str, float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     resample: float | str | None = None
+    unwrap: Mapping[str, float] = field(default_factory=dict)
     shift: Mapping[str, float] = field(default_factory=dict)
     despike: tuple[str, ...] = ()
     unmeasured: Iterable[str] | None = None
@@ -108,8 +109,8 @@ class Reading:
         log = _log(table, {**earlier._factors(table), **self.scale}, resample, repairs, source)
         log = log if mapping is None else preprocessing.prepared(log, mapping.preparation)
         spiky = [name for name in earlier.despike if name in log]
-        delays = {name: x for name, x in earlier.shift.items() if name in log}
-        return preprocessing.prepared(log, {"despike": spiky or None, "shift": delays})
+        periods, delays = ({n: x for n, x in found.items() if n in log} for found in (earlier.unwrap, earlier.shift))
+        return preprocessing.prepared(log, {"unwrap": periods, "despike": spiky or None, "shift": delays})
 
     def part(
         self, opened: Table, source: str, like: Sequence[Mapping[str, Any]]
@@ -208,6 +209,7 @@ _ARGUMENTS: dict[str, Any] = {
     "scale": lambda step: {"scale": dict(step["factors"]), "units": dict(step.get("units", {}))},
     "repair": lambda step: {"repair": tuple(step["repairs"])},
     "resample": lambda step: {"resample": step["rate"]},
+    "unwrap": lambda step: {"unwrap": dict(step["periods"])} if "periods" in step else {},
     "despike": lambda step: {"despike": tuple(step["replaced"])},
     "unmeasured": lambda step: {"unmeasured": tuple(step["signals"])},
     "shift": lambda step: {"shift": dict(step["delays"])},

@@ -23,6 +23,12 @@ from diransac.model import Model
 from diransac.simulation.compiler import compile_map
 
 _TINY = 1e-300
+# Ridge over the mean diagonal of the information in columns of unit RMS: about the rounding error of its solution.
+_RIDGE = 1e-13
+# Relative step from which on reweighting goes on.
+_CONVERGED = 1e-4
+EXACT = 1e-6
+"""Residual over the size of terms that is exact."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,17 +48,6 @@ class MotionRows:
     a: FloatArray
     u: FloatArray
     y: FloatArray
-
-    def corrected(self, model: Model, names: Sequence[str], factor: float, offset: float) -> MotionRows:
-        """The rows with some inputs, coordinates and states of first order, with their derivatives, in another unit."""
-        groups = (model.coordinates, model.rate_names, model.inputs)
-        of_q, of_v, of_u = (np.array([n in names for n in group], float) for group in groups)
-        own = np.array([n in model.first_order for n in model.rate_names], float) * of_v
-        q, v, a, u = (
-            x * (1.0 + (factor - 1.0) * of)
-            for x, of in zip((self.q, self.v, self.a, self.u), (of_q, of_v, of_v, of_u), strict=True)
-        )
-        return MotionRows(q + offset * of_q, v + offset * own, a, u + offset * of_u, self.y)
 
 
 def motion_rows(dataset: Dataset) -> list[MotionRows]:
@@ -102,37 +97,77 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
     -------
     Solution or None
     """
-    rows, n_equations = _equations(model, layout, logs)
-    if not len(rows):
+    rows, _ = scaled_equations(model, layout, logs)
+    found = robust_fit(rows) if len(rows) else None
+    if found is None:
         return None
-    scale = np.sqrt(np.square(rows).mean(axis=0))
-    has_known_terms = bool(scale[-1] > 0.0)
-    scale = size_or_one(scale)
+    scaled = rows.reshape(-1, rows.shape[2]) / found.scale
+    A, y, p = scaled[:, :-1], scaled[:, -1], found.scaled
+    residuals, whole = np.abs(A @ p - y), np.abs(A) @ np.abs(p) + np.abs(y)
+    sizes = (np.median(x.reshape(-1, rows.shape[1]), axis=0) + _TINY for x in (residuals, whole))
+    # The information at the solution: rows that are outliers there inform of nothing.
+    weighted = A * found.weights[:, None]
+    size = size_or_one(np.sqrt(np.square(weighted).mean(axis=0)))
+    return Solution(
+        found.parameters,
+        standard_errors(rows, found),
+        np.maximum(np.divide(*sizes), EXACT),
+        null_space((weighted / size).T @ (weighted / size), size * found.scale[:-1], 1e-9 * len(A)),
+        bool(rows[:, :, -1].any()),
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RobustFit:
+    """Iteratively reweighted least squares of rows ``[W b]`` in columns of unit RMS.
+
+    Parameters
+    ----------
+    scaled : (n,) array
+        Parameters in these columns.
+    scale : (n + 1,) array
+        RMS of each column.
+    weights : (n_rows n_eq,) array
+    """
+
+    scaled: FloatArray
+    scale: FloatArray
+    weights: FloatArray
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters ``(n,)``, each in its unit."""
+        return np.asarray(self.scaled * self.scale[-1] / self.scale[:-1])
+
+
+def robust_fit(rows: FloatArray) -> RobustFit | None:
+    """Fit of scaled equations ``(n, n_eq, n_p + 1)``; None if it overflows.
+
+    Parameters
+    ----------
+    rows : (n, n_eq, n_p + 1) array
+        As from `scaled_equations`.
+    """
+    n_equations, rows = rows.shape[1], rows.reshape(-1, rows.shape[2])
+    scale = size_or_one(np.sqrt(np.square(rows).mean(axis=0)))
     rows = rows / scale
     A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
     weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
+    p = np.zeros(A.shape[1])
     for _ in range(10):
-        p = np.linalg.lstsq(A * weights[:, None], y * weights, rcond=None)[0]
+        before, weighted = p, A * np.square(weights)[:, None]
+        gram = weighted.T @ A
+        ridge = _RIDGE * (float(np.trace(gram)) / max(1, len(gram)) or 1.0)
+        p = np.linalg.solve(gram + ridge * np.eye(len(gram)), weighted.T @ y)
         residuals = np.abs(A @ p - y)
         if not np.isfinite(residuals).all():
             return None
         # Each equation has its own residuals: zeros satisfy one without a known term, and would outweigh the others.
         middle = np.median(residuals.reshape(-1, n_equations), axis=0) + _TINY
         weights = 1.0 / (1.0 + np.square(residuals.reshape(-1, n_equations) / (3.0 * middle))).ravel()
-    whole = np.abs(A) @ np.abs(p) + np.abs(y)
-    sizes = (np.median(x.reshape(-1, n_equations), axis=0) + _TINY for x in (residuals, whole))
-    # The information at the solution: rows that are outliers there inform of nothing.
-    weighted = A * weights[:, None]
-    size = size_or_one(np.sqrt(np.square(weighted).mean(axis=0)))
-    units = scale[-1] / scale[:-1]
-    # A residual of a millionth of the terms is exact.
-    return Solution(
-        p * units,
-        _errors(weighted, weights * (A @ p - y)) * units,
-        np.maximum(np.divide(*sizes), 1e-6),
-        null_space((weighted / size).T @ (weighted / size), size * scale[:-1], 1e-9 * len(A)),
-        has_known_terms,
-    )
+        if np.abs(p - before).max(initial=0.0) <= _CONVERGED * np.abs(p).max(initial=0.0):
+            break
+    return RobustFit(p, scale, weights)
 
 
 def lacks_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> bool:
@@ -144,8 +179,16 @@ def lacks_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[Moti
     layout : ParameterLayout
     logs : sequence of MotionRows
     """
-    rows, _ = _equations(model, layout, logs)
-    return len(rows) > 0 and not rows[:, -1].any()
+    rows, _ = scaled_equations(model, layout, logs)
+    return len(rows) > 0 and not rows[:, :, -1].any()
+
+
+def standard_errors(rows: FloatArray, fit: RobustFit) -> FloatArray:
+    """Standard errors ``(n,)`` of a fit of scaled equations ``(n_rows, n_eq, n + 1)``, each in its unit."""
+    scaled = rows.reshape(-1, rows.shape[2]) / fit.scale
+    A, y, weights = scaled[:, :-1], scaled[:, -1], fit.weights
+    errors = _errors(A * weights[:, None], weights * (A @ fit.scaled - y))
+    return np.asarray(errors * fit.scale[-1] / fit.scale[:-1])
 
 
 def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
@@ -157,30 +200,59 @@ def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.diag(H) > 0.0, found, np.inf))
 
 
-def _equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[FloatArray, int]:
-    """Finite rows ``[W b]`` of all logs, ``(n, n_p + 1)``, each equation of unit size; number of equations."""
+def scaled_equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[FloatArray, BoolArray]:
+    """Finite rows ``[W b]`` of all logs, ``(n, n_eq, n_p + 1)``, each equation of unit size; mask of these rows.
+
+    Parameters
+    ----------
+    model : Model
+    layout : ParameterLayout
+    logs : sequence of MotionRows
+        Of which 5,000 rows each are enough to find a cause, and more are left out.
+
+    Returns
+    -------
+    rows : (n, n_eq, n_p + 1) array
+    finite : (N,) bool array
+    """
     parts = []
     for i, one in enumerate(logs):
-        every = max(1, len(one.q) // 5000)  # enough to find a cause
-        few = (np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y))
+        every = max(1, len(one.q) // 5000)
+        few = [np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y)]
         W, b = regression_rows(model, *few)
         W = layout.scattered(W, i)
-        parts.append(np.concatenate([W, b[:, :, None]], axis=2))
+        parts.append(np.concatenate([W, b[:, :, None], _known_sizes(model, few, b)[:, :, None]], axis=2))
     rows = np.concatenate(parts)
-    rows = rows[(np.abs(rows) < 1e150).all(axis=(1, 2))]  # whose squares do not overflow
-    if not len(rows):
-        return np.empty((0, rows.shape[2])), rows.shape[1]
-    return (rows / _sizes(rows)[:, None]).reshape(-1, rows.shape[2]), rows.shape[1]
+    finite = (np.abs(rows) < 1e150).all(axis=(1, 2))  # whose squares do not overflow
+    rows, sizes = rows[finite, :, :-1], rows[finite, :, -1]
+    return (rows / _sizes(rows, sizes)[:, None] if len(rows) else rows), finite
 
 
-def _sizes(rows: FloatArray) -> FloatArray:
-    """Size ``(n_eq,)`` of each equation ``[W b]`` ``(n, n_eq, n_p + 1)``: the median of its known terms.
+def _known_sizes(model: Model, motion: Sequence[FloatArray], b: FloatArray) -> FloatArray:
+    """Sizes ``(n, n_eq)`` of the known terms of equations, which may cancel in ``b``; of sensors, that of ``b``."""
+    (sizes,) = compile_map(_known_terms(model))(*motion[:4])
+    return np.concatenate([sizes, np.abs(b[:, sizes.shape[1] :])], axis=1)
+
+
+@lru_cache(maxsize=64)
+def _known_terms(model: Model) -> ca.Function:
+    """Function ``(q, v, a, u) -> sum of |known terms|``: of each acceleration, each input, and the rest."""
+    q, v, a, u = (ca.SX.sym(n, size) for n, size in list(model.argument_sizes.items())[:4])
+    r = model.residual(q, v, a, u, ca.DM.zeros(model.n_p))
+    moving = ca.vertcat(a, u)
+    rest = ca.substitute(r, moving, ca.DM.zeros(moving.shape))
+    sizes = ca.fabs(ca.jacobian(r, moving)) @ ca.fabs(moving) + ca.fabs(rest)
+    return ca.Function("known", [q, v, a, u], [ca.densify(sizes)])
+
+
+def _sizes(rows: FloatArray, known_terms: FloatArray) -> FloatArray:
+    """Size ``(n_eq,)`` of each equation ``[W b]`` ``(n, n_eq, n_p + 1)``: the median of its known terms ``(n, n_eq)``.
 
     Parameters take up units of columns, so that these change no weight of one equation against another.  An equation
     without a known term has the size of its other terms, with the parameters that the others give.
     """
-    W, b = rows[:, :, :-1], np.abs(rows[:, :, -1])
-    size = np.array([np.median(x[x > 0.0]) if x.any() else 0.0 for x in b.T])
+    W = rows[:, :, :-1]
+    size = np.array([np.median(x[x > 0.0]) if x.any() else 0.0 for x in known_terms.T])
     size = np.where(size > 1e-9 * size.max(), size, 0.0)
     known = size > 0.0
     if known.any() and not known.all():
@@ -192,18 +264,19 @@ def _sizes(rows: FloatArray) -> FloatArray:
     return np.where(size > 0.0, size, size_or_one(whole))
 
 
-def outside_bounds(layout: ParameterLayout, found: Solution) -> list[str]:
+def outside_bounds(layout: ParameterLayout, parameters: FloatArray, errors: FloatArray) -> list[str]:
     """Parameters that are outside of their bounds by more than chance.
 
     Parameters
     ----------
     layout : ParameterLayout
-    found : Solution
+    parameters, errors : (n,) array
+        Estimate with standard errors, each in its unit.
     """
     lower, upper = np.array([(max(x.lower, 0.0) if x.positive else x.lower, x.upper) for x in layout.bounds]).T
-    nearest = np.clip(found.parameters, lower, upper)
-    far = np.abs(found.parameters - nearest) > CLEAR * found.errors
-    outside = set(layout.violations(found.parameters))
+    nearest = np.clip(parameters, lower, upper)
+    far = np.abs(parameters - nearest) > CLEAR * errors
+    outside = set(layout.violations(parameters))
     return [n for n, x in zip(layout.names, far, strict=True) if n in outside and x]
 
 

@@ -9,5 +9,6 @@ In: a model, a dataset or its rows of motions.  Out: sentences, candidate terms,
 | `equivalents.py` | other parameters with the same transfer function |
 | `known_parameters.py` | fixed parameters and priors |
 | `refusal.py`, `columns.py` | causes of refusals; units and signs of columns |
+| `column_corrections.py` | corrections of columns, tested by held-out rows of the equations |
 | `candidate_terms.py`, `lacking_terms.py` | terms that a model may lack; those that are found, in words |
 """

@@ -25,6 +25,7 @@ from diransac.identification.regression.rows import (
     solved,
 )
 from diransac.identification.regression.uncertainty import CLEAR
+from diransac.identification.structure.column_corrections import CorrectionTests
 from diransac.identification.structure.columns import explanations
 from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
@@ -139,7 +140,7 @@ def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: Solution, of
     if of_rows:
         return of_rows
     values = dict(zip(layout.names, zip(found.parameters, found.errors, strict=True), strict=True))
-    clearly, outside = outside_bounds(layout, found), layout.violations(found.parameters)
+    clearly, outside = outside_bounds(layout, found.parameters, found.errors), layout.violations(found.parameters)
     named = ", ".join(f"{n} = {values[n][0]:.4g} ± {values[n][1]:.2g}" for n in clearly or outside or values)
     fitted = f"least squares of all rows gives {named}"
     if clearly:
@@ -194,6 +195,6 @@ def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:
     found = solved(model, layout, rows)
     if found is None or not signed or not signed <= set(layout.violations(found.parameters)):
         return
-    mistakes, _ = explanations(model, layout, rows, dataset.given, solved)
-    if mistakes and any(x < 0.0 for x in mistakes[0].factors.values()):
+    mistakes, _ = explanations(CorrectionTests(model, layout, rows, solved), dataset.given)
+    if mistakes and "reversed" in mistakes[0].what:
         raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")

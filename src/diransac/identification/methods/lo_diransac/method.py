@@ -40,6 +40,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     unmeasured_states,
 )
 from diransac.identification.regression.rows import excited
+from diransac.identification.structure.columns import FITTED_MOTION
 from diransac.identification.structure.equivalents import is_close
 from diransac.identification.structure.free_units import KnownUpTo, known_up_to_units
 from diransac.identification.structure.refusal import check_signs
@@ -235,8 +236,10 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     refined = likeliest.refinement
     report(callback, "estimating parameters", 0.9)
     predicts = best.decided is None or best.decided.summary.predicts
+    rows = rows_of_logs(intervals, motion)
+    dataset.keep(FITTED_MOTION, rows)
     if best.impossible or not predicts or dataset.layout.on_bounds(result.parameters).any():
-        check_signs(dataset, rows_of_logs(intervals, motion))
+        check_signs(dataset, rows)
     parts, candidates, lacks = compared_parts(likeliest, result), None, None
     if settings.suggestions:
         with suppress(np.linalg.LinAlgError):  # squares of tiny or huge numbers, of which no term can be tested

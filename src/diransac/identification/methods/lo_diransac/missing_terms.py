@@ -370,7 +370,7 @@ def connections(
     W = regressors_of_rows(model, q, v, np.random.default_rng(_SEED).permutation(a), u, p)
     known = np.isfinite(W).all(axis=(1, 2))
     x = np.column_stack([np.ones(len(v)), v, q if model.kinematics is None else q[:, :0]])[known]
-    size, W = np.linalg.norm(x, axis=0) + _TINY, W[known].reshape(known.sum(), -1)
+    size, W = np.linalg.norm(x, axis=0) + _TINY, W[known].reshape(int(known.sum()), W[0].size)
     slopes = np.linalg.lstsq(x / size, W, rcond=_RANK)[0]
     linear = np.linalg.norm(W - x / size @ slopes, axis=0) <= _RANK * np.linalg.norm(W, axis=0)
     slopes = np.where(np.abs(slopes) > _RANK * np.abs(slopes).max(axis=0), slopes, 0.0)

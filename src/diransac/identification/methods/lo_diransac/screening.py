@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, robust_std, runs
 from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
@@ -13,8 +13,11 @@ from diransac.data.filters import median_filter
 _FEWEST = 5
 # Samples of the running medians beside which inputs have spikes: those of two samples at most.  Passes over them.
 _SPIKE_WINDOW, _SPIKE_PASSES = 5, 20
-# Relative change of a signal that is a rounding error; steps of its resolution that are fewer than two.
+# Relative change of a signal that is a rounding error; a leap over the step that follows, where it is fewer than two.
 _ROUNDING, _ONE_STEP = 1e-9, 1.5
+# Probability of chance at which rows are stuck; standard deviations of noise that a leap may have.
+_CHANCE, _SIGMAS = 0.01, 3.0
+_TINY = 1e-300
 
 
 def odd_window(seconds: float, dt: float, most: int) -> int:
@@ -35,10 +38,12 @@ def odd_window(seconds: float, dt: float, most: int) -> int:
 
 
 def stuck_rows(measured: FloatArray) -> BoolArray:
-    """Rows that repeat the previous row exactly in every signal: nothing new was measured.
+    """Rows that repeat the previous row exactly in every signal, and are no standing still: nothing new was measured.
 
-    Signals of a coarse resolution repeat by themselves while they move slowly, and change by one step then; rows
-    are not stuck where each signal does.
+    Rows that repeat more often than the noise of the signals, in steps of their resolution, lets them by chance are
+    stuck.  Signals of a coarse resolution repeat at rest.  Rows are at rest if motion then begins from rest in each
+    signal, with a step that is no larger than the one that follows, or one of its resolution, within the noise; a
+    recorder that was stuck catches up.
 
     Parameters
     ----------
@@ -48,20 +53,37 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     -------
     (N,) bool array
     """
-    n, stuck = len(measured), np.zeros(len(measured), bool)
-    stuck[1:] = np.all(measured[1:] == measured[:-1], axis=1)
-    if not stuck.any():
-        return stuck
+    n, repeated = len(measured), np.zeros(len(measured), bool)
+    repeated[1:] = np.all(measured[1:] == measured[:-1], axis=1)
+    if not repeated.any():
+        return repeated
+    resolution, noise = _resolutions(measured), _noise(measured[~repeated])
+    # Probability that two samples with noise above the resolution are equal, of all signals; and of runs of them.
+    chances = resolution / np.maximum(2.0 * np.sqrt(np.pi) * noise, _TINY)
+    equal = np.where(noise > resolution, chances, 1.0).prod()
+    stuck, following = np.zeros(n, bool), np.zeros(n, int)
+    for run in runs(repeated):
+        stuck[run] = n * equal ** (run.stop - run.start) < _CHANCE
+        following[run] = min(run.stop, n - 1)
+    leaps = np.abs(measured[following] - measured)
+    steps = np.abs(measured[np.minimum(following + 1, n - 1)] - measured[following])
+    at_rest = np.all(leaps < _ONE_STEP * np.maximum(resolution, steps) + _SIGMAS * noise, axis=1)
+    return np.asarray(repeated & (stuck | ~at_rest))
+
+
+def _resolutions(measured: FloatArray) -> FloatArray:
+    """Smallest step ``(n,)`` of each signal that is no rounding error; infinite for a constant one."""
     changes = np.abs(np.diff(measured, axis=0))
     least = _ROUNDING * np.nan_to_num(np.abs(measured)).max(axis=0)
-    resolution = np.where(changes > least, changes, np.inf).min(axis=0)
-    # Of each row, the next one that is not stuck.
-    free = np.where(stuck, n, np.arange(n))
-    following = np.append(np.minimum.accumulate(free[::-1])[::-1], n)[1:]
-    leaps = np.full(measured.shape, np.inf)
-    ends = following < n
-    leaps[ends] = np.abs(measured[following[ends]] - measured[ends])
-    return np.asarray(stuck & ~np.all(leaps < _ONE_STEP * resolution, axis=1))
+    return np.asarray(np.where(changes > least, changes, np.inf).min(axis=0))
+
+
+def _noise(measured: FloatArray) -> FloatArray:
+    """Standard deviation ``(n,)`` of the noise of signals by differences of fourth order, in which motion is small."""
+    fourth = np.diff(measured, 4, axis=0)
+    fourth = fourth[np.isfinite(fourth).all(axis=1)]
+    # The variance of a difference of fourth order is 1 + 16 + 36 + 16 + 1 times that of a sample.
+    return np.asarray(robust_std(fourth, axis=0) / np.sqrt(70.0) if len(fourth) else np.zeros(measured.shape[1]))
 
 
 def screened_inputs(inputs: FloatArray, window: int, threshold: float) -> tuple[FloatArray, int]:
