@@ -192,7 +192,7 @@ def test_binary_file_is_refused_by_name(tmp_path, content):
 @pytest.mark.parametrize(
     ("number", "says"),
     [
-        (1, "format 1, of an earlier version of diransac; this one reads 9 to 10. Identify again$"),
+        (1, "format 1, of an earlier version of diransac; this one reads 9 to 11. Identify again$"),
         (8, "format 8, of an earlier"),
         (99, "format 99, of a later"),
         ("8", "no result of diransac"),

@@ -12,7 +12,7 @@ import numpy as np
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
+from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError, TimeLimitError
 from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation.agreement import disagreements
 from diransac.identification.evaluation.prediction import predictions
@@ -216,7 +216,8 @@ def _check_arguments(model: object, seed: object) -> None:
 class Identification:
     """Identification of a model from the same logs by one method after another.
 
-    Each result is that of `identify` without the tests of columns, which take several times as long as least squares.
+    Each result is that of `identify` without predictions and tests of columns, which take several times as long as
+    least squares.
     Methods share what does not depend on them: the logs bound to the model, sums of the regression, and random samples
     with their scores.
 
@@ -279,11 +280,12 @@ class _Task:
     @single_threaded()  # matrices are small: more threads would only wait for one another
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """The result from prepared logs, with findings on mistakes of their columns."""
-        return _with_tested_columns(*self.fitted(logs, progress))
+        result, dataset = self.fitted(logs, progress)
+        return _with_tested_columns(_with_predictions(result, self.given), dataset)
 
     @single_threaded()
     def fitted(self, logs: Sequence[Log], progress: Callback | None = None) -> tuple[Result, Dataset]:
-        """The result from prepared logs, without findings on mistakes of their columns, and the dataset."""
+        """The result from prepared logs, without predictions and findings on mistakes of columns, and the dataset."""
         logs = logs if self.method.needs_all_signals else [log.measured for log in logs]
         required = set(self.known.model.required_signals)
         pointwise = self.method.needs_all_signals or all(required <= set(log.signals) for log in logs)
@@ -441,6 +443,20 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     n_others = 0 if found else n_tested
     estimate = dataclasses.replace(result.estimate, mistakes=tuple(found), n_columns_tested=n_others)
     return dataclasses.replace(result, estimate=estimate)
+
+
+def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
+    """The result with open-loop predictions of the logs as they were given, as `validate` scores them."""
+    from diransac.identification.prediction.horizons import predictions_of  # which needs all of lo-diransac
+
+    own, resolution = [result.parameters_in(log) for log in logs], result.estimate.resolution
+    noise = None if result.diagnosis is None else result.diagnosis.noise_std
+    try:
+        dataset = Dataset.of(result.model, logs, pointwise=False)
+        _, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
+    except (LogError, TimeLimitError):
+        return result
+    return dataclasses.replace(result, predictions=found)
 
 
 def _summaries(

@@ -9,27 +9,28 @@ import numpy as np
 
 from diransac.identification.diagnosis import departures
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.finding import FAR, VALIDATE, Finding, Level, by_seriousness, graded
+from diransac.identification.evaluation.verdict import findings_of_predictions
+from diransac.identification.finding import FAR, NEAR, VALIDATE, Finding, Level, by_seriousness, graded
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.model.parameter import parameter_of
-from diransac.text_table import duration, number, percent, plural, share
+from diransac.text_table import duration, number, percent, plural
 
 if TYPE_CHECKING:
     from diransac.identification.diagnosis import Diagnosis
-    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.estimate import LogSummary, Prediction, Predictions
     from diransac.identification.result import Result
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Parameter
 
-_NEAR = 0.05
-"""Median error of a simulation, over the range of the signal, up to which it is good."""
+_LITTLE = 0.05
+"""Share of an acceleration that may be unexplained."""
 _HALF = 0.5
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
 
 
-def findings_of(result: Result) -> tuple[Finding, ...]:
+def findings_of(result: Result, predictions: Predictions | None = None, action: str = "") -> tuple[Finding, ...]:
     """Findings on a result, the most serious first.
 
     They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its
@@ -39,6 +40,10 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     Parameters
     ----------
     result : Result
+    predictions : Predictions, optional
+        Of other logs, in place of those of its own.
+    action : str, optional
+        What to do about predictions that are off; by default, what the identification says of the causes.
     """
     mistakes = result.estimate.mistakes
     found = by_seriousness(
@@ -51,7 +56,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
             *_diagnosis(result),
             *_bodies(result),
             *_known(result),
-            *_simulation(result),
+            *_predictions(result, predictions or result.predictions, action),
             *_inliers(result),
             *_uncertainty(result),
             *_structure(result),
@@ -162,46 +167,16 @@ def _added(suggestion: Suggestion) -> str:
     return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
 
 
-def _simulation(result: Result) -> Iterator[Finding]:
-    """Errors of the simulations relative to the signals' ranges, of the worst log.
-
-    Where the method restarts simulations, one of a whole log needs care at worst, because unmodelled forces accumulate
-    in it.
-    """
-    logs, restarts = result.logs, result.separates_forces
-    for one, found in _predicted(logs):
-        if np.isfinite(found.divergence):
-            where = f" in {one.source}" if len(logs) > 1 else ""
-            yield Finding(
-                "bad" if np.isfinite(found.restart_period) or not restarts else "care",
-                f"The simulation diverges at t = {number(found.divergence)} s{where}",
-                _remedy(result, "bad"),
-            )
-    scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
-    if scored:
-        one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
-        yield _median_error(result, found, _worst_of(one, logs))
-    if any(one.prediction is None for one in logs):
-        yield Finding("care", "No simulation is compared with the log, because its initial state is missing", VALIDATE)
-
-
-def _median_error(result: Result, found: Prediction, where: str) -> Finding:
-    """Finding on the signal with the largest median error of a simulation."""
-    errors = found.relative_errors
-    name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
-    level = graded(errors[name], _NEAR, FAR)
-    what = share(errors[name], "its range")
-    if restarted:
-        method = f"simulations restarted every {number(found.restart_period)} s"
-        what = f"{what} in excess of the noise"
-        if not errors[name]:
-            return Finding(level, f"Median error of {method}: within the noise, in every signal.")
-    else:
-        method = "one simulation of the whole log"
-        level = "care" if result.separates_forces and level == "bad" else level
-    others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
-    claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
-    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
+def _predictions(result: Result, found: Predictions | None, action: str) -> Iterator[Finding]:
+    """Findings on open-loop predictions of the logs."""
+    if found is None:
+        yield Finding("care", "No prediction is compared with the log", VALIDATE)
+        return
+    worst = max(found.judged.relative_error.values(), default=0.0)
+    yield from findings_of_predictions(found, action or _remedy(result, graded(worst, NEAR, FAR)))
+    if found is result.predictions:
+        which = "the logs" if len(result.logs) > 1 else "the log"
+        yield Finding("note", f"Evaluated on {which} of the identification; held-out data are a stricter test.")
 
 
 def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
@@ -229,7 +204,7 @@ def _inliers(result: Result) -> Iterator[Finding]:
         return
     if fraction < _HALF:
         claim = f"{text} the simulation, which is less than half of the log"
-        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
+        yield Finding("care", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
     if fraction >= 0.7:
         yield Finding("good", f"{text} the simulation.")
@@ -305,7 +280,7 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     left = found.unexplained[name]
     others = ", less of the others" if len(found.unexplained) > 1 else ""
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
-    level = graded(left, _NEAR, _HALF)
+    level = graded(left, _LITTLE, _HALF)
     yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 
@@ -427,6 +402,3 @@ def _logs(result: Result) -> Iterator[Finding]:
     if n_excluded:
         total = plural(sum(one.n_rows for one in result.logs), "row")
         yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")
-    which = "the logs" if len(result.logs) > 1 else "the log"
-    text = f"Evaluated on {which} of the identification; held-out data are a stricter test."
-    yield Finding("note", text)
