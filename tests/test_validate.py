@@ -80,7 +80,7 @@ def test_asked_horizon_is_the_one_on_top():
 
 def test_without_a_horizon_those_that_suit_the_log_and_the_whole_log_are_scored():
     validation = dr.validate(WRONG, as_log(PLANE, *noisy_flight(), DT))
-    assert [scores.horizon for scores in validation.horizons] == pytest.approx([0.05, 0.2, np.inf])
+    assert [scores.horizon for scores in validation.horizons] == pytest.approx([0.05, 0.1, 0.2, np.inf])
     assert validation.rmse == validation.judged.rmse
 
 
@@ -145,12 +145,21 @@ def test_signals_that_the_log_lacks_are_not_scored():
     assert list(validation.rmse) == ["z", "theta", "x_dot", "z_dot", "theta_dot"]
 
 
-@pytest.mark.parametrize(("missing", "says"), [("thrust", '"thrust" is missing'), ("theta", '"theta"')])
-def test_log_that_cannot_be_simulated_is_refused_by_name(missing, says):
+@pytest.mark.parametrize(
+    ("missing", "start", "says"), [("thrust", "smoothed", '"thrust" is missing'), ("theta", "measured", '"theta"')]
+)
+def test_log_that_cannot_be_simulated_is_refused_by_name(missing, start, says):
     log = as_log(PLANE, *noisy_flight(), DT)
     columns = {n: log[n] for n in log.names if n != missing}
     with pytest.raises(LogError, match=says):
-        dr.validate(TRUE, dr.Log.from_arrays(log.time, columns))
+        dr.validate(TRUE, dr.Log.from_arrays(log.time, columns), start=start)
+
+
+def test_a_state_that_nothing_measures_is_estimated_with_the_model():
+    log = as_log(PLANE, *noisy_flight(0.001), DT)
+    columns = {n: log[n] for n in log.names if n != "theta" and not n.endswith("ddot")}
+    found = dr.validate(TRUE, dr.Log.from_arrays(log.time, columns), 0.25)
+    assert found.judged.relative_error["x_dot"] < 0.05
 
 
 def test_log_without_one_complete_state_is_refused():
@@ -293,12 +302,12 @@ def scaled(J=1.0, k=1.0):
 
 
 def test_outliers_in_the_log_do_not_change_robust_scores_and_one_percent_of_a_parameter_does():
-    clean, hit = (dr.validate(scaled(), balanced(1, share)) for share in (0.0, 0.05))
+    clean, hit = (dr.validate(scaled(), balanced(1, share), 0.2) for share in (0.0, 0.05))
     assert hit.judged.horizon == clean.judged.horizon
     assert hit.judged.robust_rmse["q"] == pytest.approx(clean.judged.robust_rmse["q"], rel=0.05)
     assert hit.judged.rmse["q"] > 50.0 * hit.judged.robust_rmse["q"]
     assert hit.outlier_fraction["q"] == pytest.approx(0.05, abs=0.015)
-    worse = dr.validate(scaled(J=1.01, k=1.01), balanced(1, 0.05))
+    worse = dr.validate(scaled(J=1.01, k=1.01), balanced(1, 0.05), 0.2)
     assert worse.judged.relative_error["q"] > max(0.005, 3.0 * hit.judged.relative_error["q"])
 
 

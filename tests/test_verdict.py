@@ -196,7 +196,7 @@ def test_results_of_the_format_before_are_read(cases):
         ("lo-diransac", "usable", ""),
         ("a delay", "usable with care", "Inputs act 60 ms later than recorded, which the estimate includes"),
         ("a push", "do not rely on this", "Over the whole log the prediction of s is off by"),
-        ("a drift", "do not rely on this", "Fifths of the log that are held out have"),
+        ("a drift", "usable with care", "drag changes during the log"),
         ("a wrong sign", "do not rely on this", "mass = −1.5 kg is outside its bounds"),
         ("a violated bound", "do not rely on this", "is outside its bounds (≥ 3)"),
         ("logs that disagree", "do not rely on this", "heavy disagrees with the other logs"),

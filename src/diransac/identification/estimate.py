@@ -128,6 +128,38 @@ class LogEstimate:
     degrees_of_freedom: int = 10_000
 
 
+@dataclass(frozen=True)
+class Disagreement:
+    """Other parameters that a part of the logs gives: one half, or one of several logs.
+
+    Parameters
+    ----------
+    claim : str
+        What was found, without a stop.
+    action : str
+        What to do about it.
+    name : str
+        Parameter that differs most; empty where it is the delay of the inputs.
+    parameters : mapping of str to float
+        Parameters of that part, by name.
+    input_delay : float, optional
+        Further delay of the inputs, s.
+    log : int, optional
+        Index of the log that disagrees; -1: a part of all logs.
+    effect : float, optional
+        RMS change of predictions by these parameters, over the error of the better trivial prediction in excess of the
+        noise; 0 below the noise, NaN where no prediction was scored.
+    """
+
+    claim: str
+    action: str
+    name: str
+    parameters: Values
+    input_delay: Number = 0.0
+    log: int = -1
+    effect: Number = np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters of a model, their covariance, and the search that found them.
@@ -162,6 +194,8 @@ class Estimate:
         Noise, outliers and unmodelled forces; of lo-diransac alone.
     checks : tuple of Finding, optional
         Findings of the method's own tests.
+    disagreements : tuple of Disagreement, optional
+        Parts of the logs that give other parameters.
     mistakes : tuple of Finding, optional
         Mistakes of the logs' columns: units, signs, inputs that are zero.  A bad one explains all that is bad.
     n_columns_tested : int, optional
@@ -189,6 +223,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
+    disagreements: tuple[Disagreement, ...] = ()
     mistakes: tuple[Finding, ...] = ()
     n_columns_tested: int = 0
     suggestions: tuple[Suggestion, ...] = ()

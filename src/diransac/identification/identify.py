@@ -13,8 +13,9 @@ from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
 from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError, TimeLimitError
-from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Prediction
+from diransac.identification.estimate import Disagreement, Estimate, Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation.agreement import disagreements
+from diransac.identification.evaluation.findings import noticed_disagreements
 from diransac.identification.evaluation.prediction import predictions
 from diransac.identification.evaluation.scoring import choose_scoring, evaluate, judged_signals
 from diransac.identification.finding import Finding
@@ -306,9 +307,9 @@ class _Task:
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
-        remarks, incomparable = [""] * len(logs), list[str]()
+        named, incomparable = list[Disagreement](), list[str]()
         if self.compares:
-            remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
+            named, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         result = Result(
             model=known.model,
@@ -316,12 +317,12 @@ class _Task:
             seed=self.seed,
             settings=criteria,
             options=dict(self.method.options()),
-            estimate=known.completed(estimate, len(logs)),
-            evaluation=evaluation,
-            logs=_summaries(
-                dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
+            estimate=known.completed(
+                dataclasses.replace(estimate, disagreements=(*estimate.disagreements, *named)), len(logs)
             ),
-            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
+            evaluation=evaluation,
+            logs=_summaries(dataset, evaluation, named, predictions(estimate, evaluation, dataset, scoring, criteria)),
+            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *incomparable),
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),
         )
@@ -446,23 +447,42 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
 
 
 def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
-    """The result with open-loop predictions of the logs as they were given, as `validate` scores them."""
-    from diransac.identification.prediction.horizons import predictions_of  # which needs all of lo-diransac
+    """The result with open-loop predictions of the logs as they were given, as `validate` scores them.
+
+    Disagreements that nobody would notice are left out.
+    """
+    from diransac.identification.prediction.horizons import effect_of, predictions_of  # which needs all of lo-diransac
 
     own, resolution = [result.parameters_in(log) for log in logs], result.estimate.resolution
     noise = None if result.diagnosis is None else result.diagnosis.noise_std
     try:
         dataset = Dataset.of(result.model, logs, pointwise=False)
-        _, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
+        loops, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
+        effects = [effect_of(x, loops, found.judged.horizon) for x in result.estimate.disagreements]
     except (LogError, TimeLimitError):
         return result
-    return dataclasses.replace(result, predictions=found)
+    pairs = zip(result.estimate.disagreements, effects, strict=True)
+    known = tuple(dataclasses.replace(x, effect=effect) for x, effect in pairs)
+    tested = dataclasses.replace(result, estimate=dataclasses.replace(result.estimate, disagreements=known))
+    noticed = tuple(x for x, _ in noticed_disagreements(tested))
+    claims = [x.claim for x in noticed]
+    return dataclasses.replace(
+        result,
+        predictions=found,
+        estimate=dataclasses.replace(result.estimate, disagreements=noticed),
+        logs=tuple(x if x.remark in claims else dataclasses.replace(x, remark="") for x in result.logs),
+    )
 
 
 def _summaries(
-    dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str], predicted: Sequence[Prediction | None]
+    dataset: Dataset,
+    evaluation: Evaluation,
+    named: Sequence[Disagreement],
+    predicted: Sequence[Prediction | None],
 ) -> tuple[LogSummary, ...]:
     scores = zip(evaluation.fit_errors.tolist(), evaluation.inlier_fractions.tolist(), strict=True)
+    claims = {x.log: x.claim for x in named}
+    remarks = [claims.get(i, "") for i in range(len(dataset.given))]
     parts = zip(dataset.given, dataset.segments, scores, remarks, predicted, strict=True)
     return tuple(
         LogSummary(

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 _FORMAT = 11
 _SINCE: Mapping[int, Mapping[str, object]] = {
-    9: {"mistakes": (), "n_columns_tested": 0, "predictions": None},
-    10: {"predictions": None},
+    9: {"mistakes": (), "n_columns_tested": 0, "predictions": None, "disagreements": ()},
+    10: {"predictions": None, "disagreements": ()},
 }
 """Formats that are read besides, with the values of what they lack."""
 _BY_LOG = ("parameters", "covariance")

@@ -9,7 +9,7 @@ import numpy as np
 
 from diransac.identification.diagnosis import departures
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.evaluation.verdict import findings_of_predictions
+from diransac.identification.evaluation.verdict import findings_of_predictions, level_of_disagreement
 from diransac.identification.finding import FAR, NEAR, VALIDATE, Finding, Level, by_seriousness, graded
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.model.parameter import parameter_of
@@ -17,7 +17,7 @@ from diransac.text_table import duration, number, percent, plural
 
 if TYPE_CHECKING:
     from diransac.identification.diagnosis import Diagnosis
-    from diransac.identification.estimate import LogSummary, Prediction, Predictions
+    from diransac.identification.estimate import Disagreement, LogSummary, Prediction, Predictions
     from diransac.identification.result import Result
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Parameter
@@ -80,16 +80,30 @@ def _bounds(result: Result) -> Iterator[Finding]:
         value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
         claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
         yield Finding("bad", claim, _remedy(result, "bad"))
-    for name in result.on_bounds:
-        value = number(result.estimate.parameters[name])
-        yield Finding(
-            "bad",
-            f"{name} = {value} is on its bound, where the fit was stopped, so that its interval is unknown",
-            f"widen the bound, or fix the parameter: --fix {name.partition('[')[0]}={value}",
-        )
+    yield from _on_bounds(result)
     bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
     if bounded and not (result.violations or result.on_bounds):
         yield Finding("note", "Every parameter is within its bounds.")
+
+
+def _on_bounds(result: Result) -> Iterator[Finding]:
+    """Parameters at which a bound stopped the fit.
+
+    A bound that a parameter may have is no contradiction where the logs are predicted well with it; then nothing
+    changes if it is fixed there.  Where they are not, the bound hides what the model lacks.
+    """
+    parameters, found = result.model.parameters, result.predictions
+    good = found is not None and max(found.judged.relative_error.values(), default=np.inf) <= NEAR
+    for name in result.on_bounds:
+        value, own = result.estimate.parameters[name], parameters[parameter_of(name, parameters)]
+        claim = f"{name} = {number(value)} is on its bound, where the fit was stopped, so that its interval is unknown"
+        if not good:
+            yield Finding("bad", claim, _remedy(result, "bad"))
+        elif own.admits(value):
+            kept = f"fix it, which changes no prediction: --fix {name.partition('[')[0]}={number(value)}"
+            yield Finding("note", f"{claim}; predictions are good with it; {kept}.")
+        else:
+            yield Finding("care", claim, "widen the bound")
 
 
 def _bodies(result: Result) -> Iterator[Finding]:
@@ -380,6 +394,21 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
 # ---------------------------------------------------------------------- search and logs
 
 
+def noticed_disagreements(result: Result) -> list[tuple[Disagreement, Level]]:
+    """Parts of the logs that give other parameters, with their levels, as far as a user would notice."""
+    intervals = result.structural_intervals() if result.has_structure else result.intervals()
+    found = []
+    for one in result.estimate.disagreements:
+        moved, width = 0.0, np.inf
+        if one.name in intervals:
+            low, high = intervals[one.name]
+            moved, width = abs(one.parameters[one.name] - result.parameters[one.name]), high - low
+        level = level_of_disagreement(one, moved, width)
+        if level is not None:
+            found.append((one, level))
+    return found
+
+
 def _search(result: Result) -> Iterator[Finding]:
     if result.stop_reason == TIME_LIMIT:
         yield Finding("care", "The time limit ended the search; parameters are the best so far", "give a longer limit")
@@ -393,11 +422,10 @@ def _search(result: Result) -> Iterator[Finding]:
 
 
 def _logs(result: Result) -> Iterator[Finding]:
-    """Logs that disagree with the others, excluded rows, and the use of the logs."""
-    for one in result.logs:
-        if one.remark:
-            advice = "leave this log out, or give what differs a value per log"
-            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs", advice)
+    """Parts of the logs and logs that disagree with the others, and excluded rows."""
+    for one, level in noticed_disagreements(result):
+        effect = "" if np.isnan(one.effect) else f", which changes predictions by {percent(one.effect)} of the motion"
+        yield Finding(level, f"{one.claim}{effect}", one.action)
     n_excluded = sum(found.n_excluded for _, found in _predicted(result.logs))
     if n_excluded:
         total = plural(sum(one.n_rows for one in result.logs), "row")

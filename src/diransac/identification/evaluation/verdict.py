@@ -9,9 +9,12 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from diransac.identification.estimate import TELLING, Predictions
-from diransac.identification.finding import FAR, NEAR, Finding, graded
+from diransac.identification.estimate import TELLING, Disagreement, Predictions
+from diransac.identification.finding import FAR, NEAR, Finding, Level, graded
 from diransac.text_table import listed, number, percent
+
+_NOTICED = 1e-3
+"""Change of predictions over the motion, up to which nobody would notice that parameters are others."""
 
 
 def findings_of_predictions(found: Predictions, action: str) -> Iterator[Finding]:
@@ -32,7 +35,7 @@ def findings_of_predictions(found: Predictions, action: str) -> Iterator[Finding
     if scores.diverged:
         yield Finding("bad", f"The simulation diverges ({scores.name})", "validate over a shorter --horizon")
     elif not scores.relative_error:
-        claim = "No state moves ten times as far as its noise, so that this log tells little of the model"
+        claim = "No state moves five times as far as its noise, so that this log tells little of the model"
         yield Finding("care", claim, "give a log with more motion")
     elif found.unsmoothed:
         where = f"a log, or its stretches between gaps, are too short ({listed(found.unsmoothed)})"
@@ -44,6 +47,25 @@ def findings_of_predictions(found: Predictions, action: str) -> Iterator[Finding
         yield from _worst_state(states, over, action)
         yield from _worst_sensor({n: x for n, x in scores.relative_error.items() if n in found.sensors}, over)
     yield from _remarks(found)
+
+
+def level_of_disagreement(found: Disagreement, moved: float, width: float) -> Level | None:
+    """Level of other parameters that a part of the logs gives, by what they change; None where nobody would notice.
+
+    Parameters
+    ----------
+    found : Disagreement
+    moved, width : float
+        Difference of its parameter from the answer, and width of the structural interval, both in the parameter's unit;
+        0 and infinite of a delay.
+    """
+    if np.isnan(found.effect):
+        return "care"
+    if found.effect > FAR or (found.effect > NEAR and moved > width):
+        return "bad"
+    if found.effect > NEAR or moved > width:
+        return "care"
+    return "note" if found.effect > _NOTICED else None
 
 
 def _worst_state(errors: Mapping[str, float], over: str, action: str) -> Iterator[Finding]:

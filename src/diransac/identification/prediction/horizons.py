@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from diransac.arrays import FloatArray
 from diransac.data.dataset import Dataset
 from diransac.errors import SettingsError
 from diransac.identification.diagnosis import Resolution
-from diransac.identification.estimate import TELLING, HorizonScores, Predictions
+from diransac.identification.estimate import TELLING, Disagreement, HorizonScores, Predictions
 from diransac.identification.prediction.open_loop import OpenLoop, StartRule, pooled_scores
 
 
@@ -51,6 +52,26 @@ def predictions_of(
         tuple(dataset.model.sensors),
         tuple(x.segment.log.source for x in logs if start == "smoothed" and x.smoothed is None),
     )
+
+
+def effect_of(found: Disagreement, logs: Sequence[OpenLoop], horizon: float) -> float:
+    """Effect of a disagreement on predictions over a horizon, s, as `Disagreement` has it; the most of any log.
+
+    It is the lesser of those of all parameters and of the one that differs most: others may make up for it, and
+    parameters that a part of the logs does not determine are not its own.
+    """
+    effects = []
+    for one in [logs[found.log]] if found.log >= 0 else logs:
+        names = list(one.segment.model.parameters)
+        alone = {found.name: found.parameters[found.name]} if found.name else {}
+        every = [_replaced(names, one.parameters, x) for x in (found.parameters, alone)]
+        effects.append(min(one.change(horizon, p, found.input_delay) for p in every))
+    return max(effects)
+
+
+def _replaced(names: Sequence[str], values: FloatArray, other: Mapping[str, float]) -> FloatArray:
+    """Parameters ``(n,)`` with others in their places; those of single logs are named otherwise, and stay."""
+    return np.array([other.get(n, x) for n, x in zip(names, values, strict=True)])
 
 
 def _horizons(given: float | None, predictions: Sequence[OpenLoop]) -> list[float]:

@@ -17,7 +17,6 @@ from diransac.identification.estimate import HorizonScores
 from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.segments import OUTLYING
-from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.prediction.starts import SmoothedLog, StartEstimator, followed_log, smoothed_log
 from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.observers import driven_states
@@ -99,6 +98,7 @@ class OpenLoop:
     ) -> None:
         layout = ParameterLayout(dataset.model.parameters)
         alone = replace(dataset, segments=(dataset.segments[log],), given=(dataset.given[log],), layout=layout)
+        self._alone, self.resolution = alone, resolution
         self.segment: Segment = alone.segments[0]
         self.simulation = Simulation(alone, resolution=resolution)
         self.parameters = dataset.model.parameter_vector(parameters)
@@ -210,11 +210,9 @@ class OpenLoop:
 
     def _sums(self, rows: slice, steps: int) -> _Sums | None:
         """Sums over windows, one after another, from complete states; None without any."""
-        begins = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
-        begins = begins[self._complete[begins]]
+        begins = self._begins(rows, steps)
         if not len(begins):
             return None
-        begins = begins[:: -(-len(begins) * steps // _MOST_ROWS)]
         states, deviations = self.starts(begins)
         at = begins[:, None] + np.arange(1, steps + 1)
         measured, outliers = self.segment.measured[at], self.outliers[at]
@@ -238,6 +236,41 @@ class OpenLoop:
             measured=measured.reshape(-1, measured.shape[2]),
             outliers=outliers.reshape(-1, measured.shape[2]),
         )
+
+    def _begins(self, rows: slice, steps: int) -> IntArray:
+        """First rows of the windows of so many samples that are scored in a stretch."""
+        begins = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
+        begins = begins[self._complete[begins]]
+        return begins[:: max(1, -(-len(begins) * steps // _MOST_ROWS))]
+
+    def change(self, horizon: float, parameters: FloatArray, delay: float = 0.0) -> float:
+        """Largest RMS change of a moving state's prediction by other parameters ``(n_p,)`` and a further delay, s.
+
+        It is relative to the excess of the better trivial prediction, as `HorizonScores.relative_error`; 0 below the
+        noise.
+        """
+        timing = self.resolution.timing
+        later = replace(self.resolution, timing=replace(timing, delay=timing.delay + delay))
+        simulation = Simulation(self._alone, resolution=later) if delay else self.simulation
+        total, n = np.zeros((3, self.segment.measured.shape[1])), np.zeros(self.segment.measured.shape[1])
+        for rows in self.stretches:
+            steps = self._steps(rows, horizon)
+            begins = self._begins(rows, steps)
+            if not len(begins):
+                continue
+            states, at = self.starts(begins)[0], begins[:, None] + np.arange(1, steps + 1)
+            measured, regular = self.segment.measured[at], np.isfinite(self.segment.measured[at]) & ~self.outliers[at]
+            other = simulation.errors(0, parameters, states, begins, steps + 1)[:, 1:]
+            moved = other - self._errors(self.parameters, states, begins, steps)
+            trivial = [x - measured for x in self._trivial(states, begins, steps)]
+            total += np.array([_squares(x, regular) for x in (moved, *trivial)])
+            n += regular.sum(axis=(0, 1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved, held, uniform = total / n
+        trivial, noise = np.fmin(held, uniform), np.square(self.noise)
+        is_state = np.array([x in self.segment.model.state for x in self.segment.signals])
+        seen = is_state & _moves(trivial, noise) & (moved > noise)
+        return float(np.sqrt(moved[seen] / (trivial - noise)[seen]).max(initial=0.0))
 
     def _errors(self, parameters: FloatArray, states: FloatArray, rows: IntArray, steps: int) -> FloatArray:
         """Simulated less measured signals ``(K, steps, n_s)``, without the first row of each window."""
@@ -281,6 +314,11 @@ def _known_scale(errors: FloatArray) -> tuple[BoolArray, FloatArray]:
     return known, np.nan_to_num(lower_scale(flat, known.reshape(flat.shape)), nan=np.inf)
 
 
+def _moves(trivial: FloatArray, noise: FloatArray) -> BoolArray:
+    """Signals whose trivial predictions err by five standard deviations of the noise; arguments are mean squares."""
+    return np.asarray((trivial > 5.0**2 * noise) & (trivial > 0.0))
+
+
 def _squares(errors: FloatArray, counted: BoolArray) -> FloatArray:
     """Sum of squares ``(n_s,)``; infinite with an error that is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -321,8 +359,7 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
         ratio, robust_ratio = total.squared / spread, total.robust_squared / regular
         held, uniform, noise = total.held / count, total.uniform / count, total.of_noise / count
         trivial = np.fmin(held, uniform)
-        # A signal moves if trivial predictions err by ten standard deviations of its noise.
-        moves = judged & (trivial > 10.0**2 * noise) & (trivial > 0.0)
+        moves = judged & _moves(trivial, noise)
         excess = trivial - noise
         known = (total.of_noise + total.of_starts) / count
         error = np.sqrt(np.maximum(total.robust_squared / count - known, 0.0) / excess)
@@ -378,9 +415,9 @@ def _states(
     model, matter = segment.model, segment.model.states_behind(segment.present)
     if smoothed is not None and not model.has_equations:
         return smoothed.signals[:, : len(model.state)]
-    hidden = tuple(n for n in _hidden(segment, smoothed) if n in matter)
     derived = () if smoothed is None else derived_velocities(segment, matter)
-    derived = tuple(n for n in derived if n not in hidden)
+    lacking = [n for n in model.state if n in matter and n not in (*segment.present, *derived)]
+    hidden = tuple(n for n in lacking if smoothed is not None or n in model.first_order)
     given = dict.fromkeys((*hidden, *derived), 0.0)
     states = np.tile(segment.initial_state(given or "first"), (len(segment), 1))
     for i, name in enumerate(model.state):
@@ -392,13 +429,6 @@ def _states(
     if hidden:
         states[:, [model.state.index(n) for n in hidden]] = _unmeasured(segment, layout, parameters, states, hidden)
     return states
-
-
-def _hidden(segment: Segment, smoothed: SmoothedLog | None) -> tuple[str, ...]:
-    """States of which the log has no signal, and no derivative of one; without smoothing, those of first order."""
-    if smoothed is not None and smoothed.intervals is not None:
-        return unmeasured_states(smoothed.intervals)
-    return tuple(n for n in segment.model.first_order if n not in segment.present)
 
 
 def derived_velocities(segment: Segment, matter: Sequence[str]) -> tuple[str, ...]:
