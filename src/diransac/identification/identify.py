@@ -18,7 +18,7 @@ from diransac.identification.evaluation.agreement import disagreements
 from diransac.identification.evaluation.findings import noticed_disagreements
 from diransac.identification.evaluation.prediction import predictions
 from diransac.identification.evaluation.scoring import choose_scoring, evaluate, judged_signals
-from diransac.identification.finding import Finding
+from diransac.identification.finding import NEAR, Finding
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
 from diransac.identification.result import Result
@@ -346,10 +346,17 @@ class _Task:
             task = dataclasses.replace(task, known=task.known.of_model(with_terms(found.model, chosen)))
             begin, done = done, 0.5 * (1.0 + done) if wanted else 1.0
             try:
-                found = task.run(self.given, within(progress, begin, done, "with suggested terms: "))
+                other = task.run(self.given, within(progress, begin, done, "with suggested terms: "))
             except TimeLimitError:
                 notes.append(f"the time limit was reached before suggested terms could be added: {terms}")
                 break
+            except IdentificationError as error:
+                notes.append(f"suggested terms were not added, since identification fails with them ({error}): {terms}")
+                break
+            if not _predicts_as_well(other, found):
+                notes.append(f"suggested terms were not added, since predictions are worse with them: {terms}")
+                break
+            found = other
             notes.append(f"terms were added to the model as suggested: {terms}")
         if wanted:
             notes.append(f"nothing suggests the terms {', '.join(sorted(wanted))}, which were not added")
@@ -444,6 +451,24 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     n_others = 0 if found else n_tested
     estimate = dataclasses.replace(result.estimate, mistakes=tuple(found), n_columns_tested=n_others)
     return dataclasses.replace(result, estimate=estimate)
+
+
+def _predicts_as_well(other: Result, found: Result) -> bool:
+    """True if a result with further terms predicts no worse: held-out blocks, and the logs over the same horizons.
+
+    A result without competition predicts the logs within their noise, so that there are no held-out blocks.
+    """
+    with_terms, without = (None if x.competition is None else x.competition.competitors for x in (other, found))
+    if with_terms and without and min(x.score for x in with_terms) > min(x.score for x in without):
+        return False
+    if other.predictions is None or found.predictions is None:
+        return found.predictions is None
+    errors = [
+        {x.horizon: max(x.relative_error.values(), default=0.0) for x in scored.horizons}
+        for scored in (other.predictions, found.predictions)
+    ]
+    typical = [float(np.median(list(x.values()))) for x in errors]
+    return typical[0] <= max(typical[1], NEAR)
 
 
 def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:

@@ -177,7 +177,9 @@ def _remedy(result: Result, level: Level = "care") -> str:
 
 
 def _added(suggestion: Suggestion) -> str:
-    """The action that adds a suggested term."""
+    """The action that adds a suggested term, or makes a constant a parameter."""
+    if suggestion.option:
+        return f"make the {suggestion.name} a parameter: identify again with {suggestion.option}"
     return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
 
 
