@@ -23,6 +23,8 @@ class HeldConstant:
         Of a change; "1" of a relative one.
     option : str
         Option that makes it a parameter, as of ``diransac identify``.
+    least : float
+        Least change that is possible.
     effect : casadi.Function
         ``(q, v, a, u) -> h (n_v)``: change of the residuals per change.
     """
@@ -32,4 +34,5 @@ class HeldConstant:
     label: str
     unit: str
     option: str
+    least: float
     effect: ca.Function

@@ -296,7 +296,9 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     left = found.unexplained[name]
     others = ", less of the others" if len(found.unexplained) > 1 else ""
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
-    level = graded(left, _LITTLE, _HALF)
+    # Forces that predictions do not show, as those of vibrations, need care at worst.
+    shown = result.predictions is None or max(result.predictions.judged.relative_error.values(), default=np.inf) > FAR
+    level = graded(left, _LITTLE, _HALF if shown else np.inf)
     yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 

@@ -383,9 +383,8 @@ class _Maker:
             h = x.effect(*self.symbols[:4])
             acts = self.model.rate_names[h.sparsity().row()[0]]
             called = KINDS[x.kind][0].format(x=x.place)
-            yield CandidateTerm(
-                x.kind, acts, x.place, "", "", self._free(x.label), x.unit, h, name=called, option=x.option
-            )
+            label, bounds = self._free(x.label), (x.least, np.inf)
+            yield CandidateTerm(x.kind, acts, x.place, "", "", label, x.unit, h, bounds, called, option=x.option)
 
     def _of_load(self, place: _Place, sign: _Expression) -> Iterator[CandidateTerm]:
         """Friction that is proportional to the force of the drives in the equation, as that of gears is."""

@@ -124,13 +124,13 @@ class Mechanism:
         effects = ca.jacobian(ca.vertcat(*forces.values()), everything)
         found = []
         for k, i in enumerate(fixed):
-            body = self.description.bodies[i].name
-            for j, (kind, unit) in enumerate((("mass", "kg"), ("inertia", "1"))):
+            body, mass = self.description.bodies[i].name, float(self.description.bodies[i].inertial[3, 3])
+            for j, (kind, unit, least) in enumerate((("mass", "kg", -mass), ("inertia", "1", -1.0))):
                 h = effects[:, 2 * k + j]
                 if h.nnz():
                     effect = ca.Function("effect", [q, v, a, u], [ca.densify(h)])
                     label, option = f"{kind}_change_{identifier(body)}", f"--bodies {body}"
-                    found.append(HeldConstant(f"{kind} of a body", body, label, unit, option, effect))
+                    found.append(HeldConstant(f"{kind} of a body", body, label, unit, option, least, effect))
         return found
 
     @property
