@@ -93,7 +93,7 @@ def test_a_battery_that_sags_is_named_and_leaves_the_parameters_exact():
     assert found.verdict == "usable with care"
 
 
-def test_a_drift_in_noise_is_found_because_held_out_parts_of_the_log_are_predicted_worse():
+def test_a_drift_that_changes_predictions_by_less_than_a_hundredth_needs_care_and_is_within_intervals():
     def worn(share, p):
         return SimpleNamespace(**{**vars(p), "fc": (1.0 - 0.2 * share) * p.fc})
 
@@ -103,9 +103,8 @@ def test_a_drift_in_noise_is_found_because_held_out_parts_of_the_log_are_predict
         flights.Regime("none", machine, noise=10.0),
     ]
     drifting, steady = (fresh(x) for x in regimes)
-    assert drifting.verdict == "do not rely on this"
-    assert any(x.startswith("fc changes during the log") for x in drifting.findings)
-    assert any(x.startswith("Fifths of the log that are held out have") for x in drifting.findings)
+    assert drifting.verdict == "usable with care"
+    assert all(drifting.inside.values())
     assert not any("held out" in x or "changes" in x for x in steady.findings)
 
 

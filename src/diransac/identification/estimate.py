@@ -15,6 +15,8 @@ from diransac.identification.structure.lacking_terms import PossibleTerm, Sugges
 
 TIME_LIMIT = "time limit reached"
 """Stop reason of a search that a limit on its time ended."""
+TELLING = 0.1
+"""Sensitivity of predictions to 1 % of the parameters and to the start, up to which a horizon tells models apart."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,38 @@ class LogEstimate:
     degrees_of_freedom: int = 10_000
 
 
+@dataclass(frozen=True)
+class Disagreement:
+    """Other parameters that a part of the logs gives: one half, or one of several logs.
+
+    Parameters
+    ----------
+    claim : str
+        What was found, without a stop.
+    action : str
+        What to do about it.
+    name : str
+        Parameter that differs most; empty where it is the delay of the inputs.
+    parameters : mapping of str to float
+        Parameters of that part, by name.
+    input_delay : float, optional
+        Further delay of the inputs, s.
+    log : int, optional
+        Index of the log that disagrees; -1: a part of all logs.
+    effect : float, optional
+        RMS change of predictions by these parameters, over the error of the better trivial prediction in excess of the
+        noise; 0 below the noise, NaN where no prediction was scored.
+    """
+
+    claim: str
+    action: str
+    name: str
+    parameters: Values
+    input_delay: Number = 0.0
+    log: int = -1
+    effect: Number = np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Parameters of a model, their covariance, and the search that found them.
@@ -159,6 +193,8 @@ class Estimate:
         Noise, outliers and unmodelled forces; of lo-diransac alone.
     checks : tuple of Finding, optional
         Findings of the method's own tests.
+    disagreements : tuple of Disagreement, optional
+        Parts of the logs that give other parameters.
     mistakes : tuple of Finding, optional
         Mistakes of the logs' columns: units, signs, inputs that are zero.  A bad one explains all that is bad.
     n_columns_tested : int, optional
@@ -186,6 +222,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     diagnosis: Diagnosis | None = None
     checks: tuple[Finding, ...] = ()
+    disagreements: tuple[Disagreement, ...] = ()
     mistakes: tuple[Finding, ...] = ()
     n_columns_tested: int = 0
     suggestions: tuple[Suggestion, ...] = ()
@@ -236,18 +273,98 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Prediction:
-    """Agreement of the simulation of one log, which restarts periodically where the smoothed states are known.
+class HorizonScores:
+    """Open-loop prediction at one horizon, by signal.
+
+    Robust scores leave out outliers: samples further than six standard deviations of the noise from the motion as it
+    is smoothed without the model, so that no error of the model is one.
 
     Parameters
     ----------
-    restart_period : float
-        Time after which the simulation restarts, s; infinite: one simulation of the whole log.
-    divergence : float
-        Time of the log at which the simulation becomes infinite, s; infinite if it does not.
-    relative_errors : mapping of str to float
-        Median absolute error of each signal with an inlier threshold, less that of its noise where that is known, over
-        the range of the signal.
+    horizon : float
+        Time after which the simulation restarts, s; infinite: never.
+    windows : int
+        Number of simulations that were scored.
+    diverged : int
+        Number of simulations that became infinite, which makes the scores infinite.
+    rmse : mapping of str to float
+        Root mean squared error of each signal, its unit.
+    fit_percent : mapping of str to float
+        ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
+    r_squared : mapping of str to float
+        ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``.
+    robust_rmse, robust_fit_percent, robust_r_squared : mapping of str to float
+        The same without outliers.
+    hold_last : mapping of str to float
+        RMSE, without outliers, of the prediction that nothing changes after the start of a window.
+    constant_velocity : mapping of str to float
+        RMSE, without outliers, of the prediction that every coordinate goes on at the velocity of the start.
+    relative_error : mapping of str to float
+        Of each state and sensor that moves: RMSE in excess of the noise and of the effect of uncertain starts, over the
+        excess of the better of these two predictions.  0: perfect; 1: no better than a trivial prediction.
+    sensitivity : mapping of str to float
+        Of each state and sensor that moves: RMS effect on the prediction of 1 % changes of the parameters, of random
+        signs, and of uncertain starts, over the same excess.
+    of_starts : mapping of str to float
+        The part of uncertain starts in it, an error up to which cannot be seen.
+    """
+
+    horizon: Number
+    windows: int
+    diverged: int
+    rmse: Values
+    fit_percent: Values
+    r_squared: Values
+    robust_rmse: Values
+    robust_fit_percent: Values
+    robust_r_squared: Values
+    hold_last: Values
+    constant_velocity: Values
+    relative_error: Values
+    sensitivity: Values
+    of_starts: Values
+
+    @property
+    def name(self) -> str:
+        """The horizon in words."""
+        return "whole log" if np.isinf(self.horizon) else f"{self.horizon:g} s"
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Open-loop predictions of logs at several horizons, the shortest first, and the one that is judged.
+
+    Parameters
+    ----------
+    horizons : tuple of HorizonScores
+    asked : int
+        Index of the judged horizon: the requested one, else the longest over which predictions tell models apart.
+    outlier_fraction : mapping of str to float
+        Part of each signal's samples that robust scores leave out.
+    sensors : tuple of str
+        Those signals that are sensors.
+    unsmoothed : tuple of str
+        Names of the logs that are too short to be smoothed: their windows start at recorded samples, with their noise.
+    """
+
+    horizons: tuple[HorizonScores, ...]
+    asked: int
+    outlier_fraction: Values
+    sensors: tuple[str, ...]
+    unsmoothed: tuple[str, ...]
+
+    @property
+    def judged(self) -> HorizonScores:
+        """Scores of the judged horizon."""
+        return self.horizons[self.asked]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the model leaves of one log.
+
+    Parameters
+    ----------
     unexplained : mapping of str to float
         Share of each acceleration that the model leaves unexplained; empty where that is unknown.
     n_rows, n_excluded : int
@@ -256,9 +373,6 @@ class Prediction:
         Beginning and end of the window of the log with the lowest inlier fraction, s, and that fraction.
     """
 
-    restart_period: Number
-    divergence: Number
-    relative_errors: Values
     unexplained: Values
     n_rows: int
     n_excluded: int

@@ -77,6 +77,8 @@ class Finding(str):
 Verdict = Literal["usable", "usable with care", "do not rely on this"]
 
 
+NEAR = 0.1
+"""Error of a prediction over the motion up to which a model is good."""
 FAR = 0.25
 """Error of a prediction over the motion up to which a model needs care, and beyond which it is bad."""
 VALIDATE = "predict a log that it was not identified from: diransac validate RESULT.json OTHER_LOG"

@@ -12,12 +12,13 @@ import numpy as np
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, distinct_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.errors import DiransacError, IdentificationError, SettingsError, TimeLimitError
-from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Prediction
+from diransac.errors import DiransacError, IdentificationError, LogError, SettingsError, TimeLimitError
+from diransac.identification.estimate import Disagreement, Estimate, Evaluation, LogSummary, Prediction
 from diransac.identification.evaluation.agreement import disagreements
+from diransac.identification.evaluation.findings import noticed_disagreements
 from diransac.identification.evaluation.prediction import predictions
 from diransac.identification.evaluation.scoring import choose_scoring, evaluate, judged_signals
-from diransac.identification.finding import Finding
+from diransac.identification.finding import NEAR, Finding
 from diransac.identification.method import Callback, Method, fit, numerical_failures, report, within
 from diransac.identification.methods import DEFAULT, METHODS, WITH_ESTIMATOR, estimator_named, factory
 from diransac.identification.result import Result
@@ -216,7 +217,8 @@ def _check_arguments(model: object, seed: object) -> None:
 class Identification:
     """Identification of a model from the same logs by one method after another.
 
-    Each result is that of `identify` without the tests of columns, which take several times as long as least squares.
+    Each result is that of `identify` without predictions and tests of columns, which take several times as long as
+    least squares.
     Methods share what does not depend on them: the logs bound to the model, sums of the regression, and random samples
     with their scores.
 
@@ -281,11 +283,12 @@ class _Task:
     @single_threaded()  # matrices are small: more threads would only wait for one another
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
         """The result from prepared logs, with findings on mistakes of their columns."""
-        return _with_tested_columns(*self.fitted(logs, progress))
+        result, dataset = self.fitted(logs, progress)
+        return _with_tested_columns(_with_predictions(result, self.given), dataset)
 
     @single_threaded()
     def fitted(self, logs: Sequence[Log], progress: Callback | None = None) -> tuple[Result, Dataset]:
-        """The result from prepared logs, without findings on mistakes of their columns, and the dataset."""
+        """The result from prepared logs, without predictions and findings on mistakes of columns, and the dataset."""
         logs = logs if self.method.needs_all_signals else [log.measured for log in logs]
         required = set(self.known.model.required_signals)
         pointwise = self.method.needs_all_signals or all(required <= set(log.signals) for log in logs)
@@ -306,9 +309,9 @@ class _Task:
         report(progress, "evaluating", fitted)
         scoring = choose_scoring(dataset, criteria)
         evaluation = evaluate(estimate, dataset, scoring, criteria)
-        remarks, incomparable = [""] * len(logs), list[str]()
+        named, incomparable = list[Disagreement](), list[str]()
         if self.compares:
-            remarks, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
+            named, incomparable = disagreements(self.method, dataset, self.seed, within(progress, fitted, 1.0))
         report(progress, "done", 1.0)
         result = Result(
             model=known.model,
@@ -316,12 +319,12 @@ class _Task:
             seed=self.seed,
             settings=criteria,
             options=dict(self.method.options()),
-            estimate=known.completed(estimate, len(logs)),
-            evaluation=evaluation,
-            logs=_summaries(
-                dataset, evaluation, remarks, predictions(estimate, evaluation, dataset, scoring, criteria)
+            estimate=known.completed(
+                dataclasses.replace(estimate, disagreements=(*estimate.disagreements, *named)), len(logs)
             ),
-            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *(x for x in remarks if x), *incomparable),
+            evaluation=evaluation,
+            logs=_summaries(dataset, evaluation, named, predictions(estimate, evaluation, dataset, scoring, criteria)),
+            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *incomparable),
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),
         )
@@ -345,10 +348,17 @@ class _Task:
             task = dataclasses.replace(task, known=task.known.of_model(with_terms(found.model, chosen)))
             begin, done = done, 0.5 * (1.0 + done) if wanted else 1.0
             try:
-                found = task.run(self.given, within(progress, begin, done, "with suggested terms: "))
+                other = task.run(self.given, within(progress, begin, done, "with suggested terms: "))
             except TimeLimitError:
                 notes.append(f"the time limit was reached before suggested terms could be added: {terms}")
                 break
+            except IdentificationError as error:
+                notes.append(f"suggested terms were not added, since identification fails with them ({error}): {terms}")
+                break
+            if not _predicts_as_well(other, found):
+                notes.append(f"suggested terms were not added, since predictions are worse with them: {terms}")
+                break
+            found = other
             notes.append(f"terms were added to the model as suggested: {terms}")
         if wanted:
             notes.append(f"nothing suggests the terms {', '.join(sorted(wanted))}, which were not added")
@@ -445,10 +455,61 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     return dataclasses.replace(result, estimate=estimate)
 
 
+def _predicts_as_well(other: Result, found: Result) -> bool:
+    """True if a result with further terms predicts no worse: held-out blocks, and the logs over the same horizons.
+
+    A result without competition predicts the logs within their noise, so that there are no held-out blocks.
+    """
+    with_terms, without = (None if x.competition is None else x.competition.competitors for x in (other, found))
+    if with_terms and without and min(x.score for x in with_terms) > min(x.score for x in without):
+        return False
+    if other.predictions is None or found.predictions is None:
+        return found.predictions is None
+    errors = [
+        {x.horizon: max(x.relative_error.values(), default=0.0) for x in scored.horizons}
+        for scored in (other.predictions, found.predictions)
+    ]
+    typical = [float(np.median(list(x.values()))) for x in errors]
+    return typical[0] <= max(typical[1], NEAR)
+
+
+def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
+    """The result with open-loop predictions of the logs as they were given, as `validate` scores them.
+
+    Disagreements that nobody would notice are left out.
+    """
+    from diransac.identification.prediction.horizons import effect_of, predictions_of  # which needs all of lo-diransac
+
+    own, resolution = [result.parameters_in(log) for log in logs], result.estimate.resolution
+    noise = None if result.diagnosis is None else result.diagnosis.noise_std
+    try:
+        dataset = Dataset.of(result.model, logs, pointwise=False)
+        loops, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
+        effects = [effect_of(x, loops, found.judged.horizon) for x in result.estimate.disagreements]
+    except (LogError, TimeLimitError):
+        return result
+    pairs = zip(result.estimate.disagreements, effects, strict=True)
+    known = tuple(dataclasses.replace(x, effect=effect) for x, effect in pairs)
+    tested = dataclasses.replace(result, estimate=dataclasses.replace(result.estimate, disagreements=known))
+    noticed = tuple(x for x, _ in noticed_disagreements(tested))
+    claims = [x.claim for x in noticed]
+    return dataclasses.replace(
+        result,
+        predictions=found,
+        estimate=dataclasses.replace(result.estimate, disagreements=noticed),
+        logs=tuple(x if x.remark in claims else dataclasses.replace(x, remark="") for x in result.logs),
+    )
+
+
 def _summaries(
-    dataset: Dataset, evaluation: Evaluation, remarks: Sequence[str], predicted: Sequence[Prediction | None]
+    dataset: Dataset,
+    evaluation: Evaluation,
+    named: Sequence[Disagreement],
+    predicted: Sequence[Prediction | None],
 ) -> tuple[LogSummary, ...]:
     scores = zip(evaluation.fit_errors.tolist(), evaluation.inlier_fractions.tolist(), strict=True)
+    claims = {x.log: x.claim for x in named}
+    remarks = [claims.get(i, "") for i in range(len(dataset.given))]
     parts = zip(dataset.given, dataset.segments, scores, remarks, predicted, strict=True)
     return tuple(
         LogSummary(

@@ -17,7 +17,7 @@ from diransac.data.log import Log
 from diransac.errors import DiransacError, ResultError, SettingsError
 from diransac.identification import result_files
 from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.estimate import Competition, Estimate, Evaluation, LogSummary
+from diransac.identification.estimate import Competition, Estimate, Evaluation, LogSummary, Predictions
 from diransac.identification.evaluation.findings import findings_of
 from diransac.identification.finding import Finding, Verdict, verdict_of
 from diransac.identification.regression.uncertainty import student_quantile, students_draws, two_sided
@@ -68,6 +68,8 @@ class Result:
         Names of the parameters that were not identified but given; their standard errors are zero.
     priors : mapping of str to (float, float), optional
         Mean and standard deviation of the Gaussian prior of each parameter that had one, in its unit.
+    predictions : Predictions, optional
+        Open-loop predictions of the logs; None where they were not scored.
     """
 
     model: Model
@@ -82,6 +84,7 @@ class Result:
     bandwidth_sensitivity: Mapping[str, tuple[float, float]] | None = None
     fixed: tuple[str, ...] = ()
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    predictions: Predictions | None = None
 
     @cached_property
     def layout(self) -> ParameterLayout:

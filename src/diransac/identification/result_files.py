@@ -15,7 +15,7 @@ from diransac.atomic import write_text
 from diransac.data.dataset import ParameterLayout
 from diransac.errors import ResultError, SettingsError
 from diransac.identification.diagnosis import Resolution
-from diransac.identification.estimate import Estimate, Evaluation, LogSummary
+from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Predictions
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
 from diransac.identification.settings import Settings
 from diransac.identification.structure.lacking_terms import check_terms
@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from diransac.export import PortableModel
     from diransac.identification.result import Result
 
-_FORMAT = 10
-_SINCE: Mapping[int, Mapping[str, object]] = {9: {"mistakes": (), "n_columns_tested": 0}}
+_FORMAT = 11
+_SINCE: Mapping[int, Mapping[str, object]] = {
+    9: {"mistakes": (), "n_columns_tested": 0, "predictions": None, "disagreements": ()},
+    10: {"predictions": None, "disagreements": ()},
+}
 """Formats that are read besides, with the values of what they lack."""
 _BY_LOG = ("parameters", "covariance")
 """Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
@@ -47,6 +50,7 @@ class _Provenance:
     bandwidth_sensitivity: NumberPairs | None
     fixed: tuple[str, ...]
     priors: NumberPairs
+    predictions: Predictions | None
 
 
 def as_dict(result: Result) -> dict[str, Any]:

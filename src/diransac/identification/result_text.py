@@ -110,6 +110,5 @@ def _assessed(result: Result) -> list[str]:
         lines.append(f"  {name}: {100 * half:+.2g} % at half the filter's bandwidth, {100 * double:+.2g} % at twice")
     if result.competition is not None:
         lines.append(f"  {result.competition.sentence()}")
-    remarks = [log.remark for log in result.logs]
-    lines += [f"  {note}" for note in result.notes if note not in remarks]
+    lines += [f"  {note}" for note in result.notes]
     return [*lines, *(f"? {suggestion.change}" for suggestion in result.suggestions), next_line(result.findings)]

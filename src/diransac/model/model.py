@@ -27,6 +27,7 @@ from diransac.arrays import BoolArray, FloatArray
 from diransac.errors import ModelError, ResultError
 from diransac.model import derivation, expressions
 from diransac.model.derivation import Probe, Symbols
+from diransac.model.held import HeldConstant
 from diransac.model.parameter import Parameter
 from diransac.model.sensors import Sensor, with_parameters_of
 from diransac.model.signals import Signals
@@ -109,6 +110,14 @@ class Model(Signals):
         if outputs:
             results["measurement"] = ca.vertcat(*outputs)
         self._restore(self._written((q, v, a, u, p), results))
+
+    held_by: Callable[[Model], Sequence[HeldConstant]] | None = None
+    """Maker of the constants that the model holds; a model that was stored has none."""
+
+    @cached_property
+    def held(self) -> tuple[HeldConstant, ...]:
+        """Constants that are no parameters, such as masses of bodies in a description, and might be wrong."""
+        return () if self.held_by is None else tuple(self.held_by(self))
 
     def _written(self, symbols: Sequence[ca.SX], results: Mapping[str, ca.SX]) -> dict[str, Any]:
         """Equations as data by name, checked; None for those that the model lacks."""
@@ -382,7 +391,7 @@ class Model(Signals):
             return [self.kinematics(ca.vertcat(*q), ca.vertcat(*v))]
 
         has_kinematics = self.kinematics is not None
-        return Model(
+        model = Model(
             name,
             self.coordinates,
             self.inputs,
@@ -394,6 +403,8 @@ class Model(Signals):
             sensors=sensors,
             description=self.description,
         )
+        model.held_by = self.held_by
+        return model
 
     def _coordinate_rates(self, q: ca.SX, v: ca.SX) -> ca.SX:
         """Derivatives of the coordinates."""

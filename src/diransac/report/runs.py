@@ -14,7 +14,6 @@ from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.identification.assessment.horizons import OpenLoop
 from diransac.identification.assessment.validation import Validation, validate
 from diransac.identification.diagnosis import Departure, Diagnosis, departures
 from diransac.identification.estimate import LogSummary
@@ -29,6 +28,7 @@ from diransac.identification.evaluation.prediction import (
 )
 from diransac.identification.evaluation.scoring import Scoring, as_estimated, choose_scoring, judged_signals
 from diransac.identification.evaluation.simulation import Simulation
+from diransac.identification.prediction.open_loop import OpenLoop
 from diransac.identification.result import Result
 from diransac.report.rendering import numbered
 from diransac.simulation import inlier_mask
@@ -256,9 +256,8 @@ def _restarts(
 
 def _estimated_starts(held_out: OpenLoop, n_rows: int) -> Restarts:
     """Initial states of windows of so many rows."""
-    found = [(rows, held_out.starts(part, rows)[0]) for part, rows in held_out.window_rows(n_rows)]
-    rows, states = (np.concatenate(x) for x in zip(*found, strict=True))
-    return Restarts(rows, states, n_rows)
+    rows = held_out.window_rows(n_rows)
+    return Restarts(rows, held_out.starts(rows)[0], n_rows)
 
 
 def _inliers(run: Run, scoring: Scoring) -> BoolArray:

@@ -9,10 +9,10 @@ from functools import partial
 import numpy as np
 
 from diransac.data.log import Log
-from diransac.identification.assessment.horizons import HorizonScores
 from diransac.identification.assessment.innovations import Innovations
 from diransac.identification.assessment.validation import Validation
 from diransac.identification.diagnosis import Diagnosis
+from diransac.identification.estimate import HorizonScores
 from diransac.identification.evaluation.findings import bounds_text
 from diransac.identification.finding import Finding, Level, Verdict, next_line, shown, verdict_of
 from diransac.report.figures import Scale, Tick, padded, ticks
@@ -71,22 +71,26 @@ class Card:
 
 
 def card(entry: Entry) -> Card:
-    """The verdict on one result: its own findings, and before them those on held-out logs of the page."""
-    held_out = [run for run in entry.runs if run.held_out]
-    groups = [(f"Held out, {_name(run)}", _findings_on(run)) for run in held_out]
-    groups.append((f"Identification from {_sources([entry])}" if held_out else "", entry.result.findings))
-    every = [finding for _, found in groups for finding in found]
-    verdict, (kept, n_more) = verdict_of(every), shown(every, good=True)
-    few = [(about, tuple(x for x in kept if any(x is y for y in found))) for about, found in groups]
-    few = [(about, found) for about, found in few if found]
+    """The verdict on one result: its own findings, or those of `validate` with the held-out logs of the page."""
+    held_out, own = [run for run in entry.runs if run.held_out], entry.result.findings
+    found = [_findings_on(run) for run in held_out]
+    groups = [
+        (f"Held out, {_name(x)}", tuple(y for y in on if y not in own)) for x, on in zip(held_out, found, strict=True)
+    ]
+    kept = tuple(x for x in own if all(x in on for on in found))
+    groups.append((f"Identification from {_sources([entry])}" if held_out else "", kept))
+    every = [finding for _, some in groups for finding in some]
+    verdict, (few, n_more) = verdict_of(every), shown(every, good=True)
+    listed = [(name, tuple(x for x in few if x in some)) for name, some in groups]
     levels: dict[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
-    return Card(entry.label, levels[verdict], verdict, tuple(few), n_more, next_line(every))
+    chosen = tuple((name, some) for name, some in listed if some)
+    return Card(entry.label, levels[verdict], verdict, chosen, n_more, next_line(every))
 
 
 def _findings_on(run: Run) -> tuple[Finding, ...]:
-    """Findings of the validation of a held-out log."""
+    """Findings of `validate` with a held-out log."""
     if isinstance(run.validation, str):
-        return (Finding("care", f"Not scored: {run.validation}"),)
+        return (Finding("care", f"Not scored: {run.validation}", "give a log that can be"), *run.result.findings)
     return run.validation.findings
 
 

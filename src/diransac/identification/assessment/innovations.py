@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.assessment.horizons import OpenLoop
+from diransac.identification.prediction.open_loop import OpenLoop
 
 _SIZES = np.array([0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0])
 """Sizes of unmodelled forces that are tried, over the RMS change of a velocity from sample to sample."""

@@ -13,12 +13,12 @@ from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError, check_known
-from diransac.identification.assessment.horizons import derived_velocities
-from diransac.identification.assessment.window_starts import smoothed_log
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.evaluation.prediction import Restarts, restart_rows, simulated_rows
 from diransac.identification.evaluation.simulation import Simulation
 from diransac.identification.identify import checked_hold
+from diransac.identification.prediction.open_loop import derived_velocities
+from diransac.identification.prediction.starts import smoothed_log
 from diransac.identification.result import Result
 from diransac.identification.settings import finite_number
 from diransac.model import Model

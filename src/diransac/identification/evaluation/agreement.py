@@ -9,13 +9,14 @@ import numpy as np
 
 from diransac.data.dataset import Dataset
 from diransac.errors import DiransacError, TimeLimitError
-from diransac.identification.estimate import LogEstimate
+from diransac.identification.estimate import Disagreement, LogEstimate
 from diransac.identification.method import Callback, Method, fit, within
 from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
 
 _DELAY = "input delay [s]"
 """Name of the delay of the inputs in a sentence."""
+_ADVICE = "leave this log out, or give what differs a value per log"
 
 
 @runtime_checkable
@@ -28,8 +29,8 @@ class ComparesLogs(Protocol):
 
 def disagreements(
     method: Method, dataset: Dataset, seed: int, callback: Callback | None = None
-) -> tuple[list[str], list[str]]:
-    """A sentence for each log whose own estimate disagrees with those of the others; empty where it agrees.
+) -> tuple[list[Disagreement], list[str]]:
+    """Logs whose own estimate disagrees with those of the others.
 
     The second list has a sentence on every log that cannot be compared, because alone it gives no estimate.
 
@@ -44,13 +45,13 @@ def disagreements(
     Birge 1932, "The calculation of errors by the method of least squares"; Cochran 1954, "The combination of estimates
     from different experiments"; Hadi and Simonoff 1993 (backward removal).
     """
-    n, remarks, notes = len(dataset.segments), [""] * len(dataset.segments), list[str]()
+    n, named, notes = len(dataset.segments), list[Disagreement](), list[str]()
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
     found: dict[int, LogEstimate] = {}
     try:
         every = _each(method, dataset, seed, callback)
     except TimeLimitError:
-        return remarks, ["the time limit was reached before the logs were compared with each other"]
+        return named, ["the time limit was reached before the logs were compared with each other"]
     for i, own in enumerate(every):
         if not isinstance(own, str) and any(np.isfinite(own.standard_errors[name]) for name in shared):
             found[i] = own
@@ -64,11 +65,13 @@ def disagreements(
         worst = max(found, key=lambda i: tests[i][0])
         if tests[worst][0] <= 1.0:
             break
-        named = list(found) if len(found) == 2 else [worst]
-        for i in named:
-            remarks[i] = f"{dataset.given[i].source} disagrees with the other logs: {tests[i][1]}"
+        for i in list(found) if len(found) == 2 else [worst]:
+            _, name, text, late = tests[i]
+            alone = {x: found[i].parameters[x] for x in shared if np.isfinite(found[i].standard_errors[x])}
+            claim = f"{dataset.given[i].source} disagrees with the other logs: {text}"
+            named.append(Disagreement(claim, _ADVICE, "" if name == _DELAY else name, alone, late, i))
             del found[i]
-    return remarks, notes
+    return named, notes
 
 
 def _each(method: Method, dataset: Dataset, seed: int, callback: Callback | None) -> Sequence[LogEstimate | str]:
@@ -101,9 +104,9 @@ def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callba
 
 def _worst(
     found: Mapping[int, LogEstimate], i: int, parameters: Sequence[str], level: float, dt: float
-) -> tuple[float, str]:
-    """Largest difference of log ``i`` from the others over what is allowed, and a sentence on it."""
-    worst, sentence = 0.0, ""
+) -> tuple[float, str, str, float]:
+    """Largest difference of log ``i`` from the others over what is allowed, its name and text, and its delay, s."""
+    worst, named, text, late = 0.0, "", "", 0.0
     t = student_quantile(min(x.degrees_of_freedom for x in found.values()), 1.0 - level)
     for name in (*parameters, _DELAY):
         own, variance = _marginal(found[i], name)
@@ -114,13 +117,12 @@ def _worst(
         mean, spread, ratio = _combined(others)
         # A difference of 0.1 %, or of a quarter of a sample, is none, however narrow the intervals are.
         allowed = max(t * np.sqrt(ratio * (variance + spread)), 1e-3 * abs(mean), 0.25 * dt if name == _DELAY else 0.0)
+        late = float(own - mean) if name == _DELAY else 0.0
         surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
         if surprise > worst:
-            worst = float(surprise)
-            sentence = (
-                f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
-            )
-    return worst, sentence
+            worst, named = float(surprise), name
+            text = f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
+    return worst, named, text, late
 
 
 def _marginal(found: LogEstimate, name: str) -> tuple[float, float]:

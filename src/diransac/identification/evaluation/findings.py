@@ -9,27 +9,28 @@ import numpy as np
 
 from diransac.identification.diagnosis import departures
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.finding import FAR, VALIDATE, Finding, Level, by_seriousness, graded
+from diransac.identification.evaluation.verdict import findings_of_predictions, level_of_disagreement
+from diransac.identification.finding import FAR, NEAR, VALIDATE, Finding, Level, by_seriousness, graded
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.model.parameter import parameter_of
-from diransac.text_table import duration, number, percent, plural, share
+from diransac.text_table import duration, number, percent, plural
 
 if TYPE_CHECKING:
     from diransac.identification.diagnosis import Diagnosis
-    from diransac.identification.estimate import LogSummary, Prediction
+    from diransac.identification.estimate import Disagreement, LogSummary, Prediction, Predictions
     from diransac.identification.result import Result
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Parameter
 
-_NEAR = 0.05
-"""Median error of a simulation, over the range of the signal, up to which it is good."""
+_LITTLE = 0.05
+"""Share of an acceleration that may be unexplained."""
 _HALF = 0.5
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
 
 
-def findings_of(result: Result) -> tuple[Finding, ...]:
+def findings_of(result: Result, predictions: Predictions | None = None, action: str = "") -> tuple[Finding, ...]:
     """Findings on a result, the most serious first.
 
     They depend on what the result contains alone: parameters and intervals, the predictions of its logs, its
@@ -39,6 +40,10 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
     Parameters
     ----------
     result : Result
+    predictions : Predictions, optional
+        Of other logs, in place of those of its own.
+    action : str, optional
+        What to do about predictions that are off; by default, what the identification says of the causes.
     """
     mistakes = result.estimate.mistakes
     found = by_seriousness(
@@ -51,7 +56,7 @@ def findings_of(result: Result) -> tuple[Finding, ...]:
             *_diagnosis(result),
             *_bodies(result),
             *_known(result),
-            *_simulation(result),
+            *_predictions(result, predictions or result.predictions, action),
             *_inliers(result),
             *_uncertainty(result),
             *_structure(result),
@@ -75,16 +80,30 @@ def _bounds(result: Result) -> Iterator[Finding]:
         value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
         claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
         yield Finding("bad", claim, _remedy(result, "bad"))
-    for name in result.on_bounds:
-        value = number(result.estimate.parameters[name])
-        yield Finding(
-            "bad",
-            f"{name} = {value} is on its bound, where the fit was stopped, so that its interval is unknown",
-            f"widen the bound, or fix the parameter: --fix {name.partition('[')[0]}={value}",
-        )
+    yield from _on_bounds(result)
     bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
     if bounded and not (result.violations or result.on_bounds):
         yield Finding("note", "Every parameter is within its bounds.")
+
+
+def _on_bounds(result: Result) -> Iterator[Finding]:
+    """Parameters at which a bound stopped the fit.
+
+    A bound that a parameter may have is no contradiction where the logs are predicted well with it; then nothing
+    changes if it is fixed there.  Where they are not, the bound hides what the model lacks.
+    """
+    parameters, found = result.model.parameters, result.predictions
+    good = found is not None and max(found.judged.relative_error.values(), default=np.inf) <= NEAR
+    for name in result.on_bounds:
+        value, own = result.estimate.parameters[name], parameters[parameter_of(name, parameters)]
+        claim = f"{name} = {number(value)} is on its bound, where the fit was stopped, so that its interval is unknown"
+        if not good:
+            yield Finding("bad", claim, _remedy(result, "bad"))
+        elif own.admits(value):
+            kept = f"fix it, which changes no prediction: --fix {name.partition('[')[0]}={number(value)}"
+            yield Finding("note", f"{claim}; predictions are good with it; {kept}.")
+        else:
+            yield Finding("care", claim, "widen the bound")
 
 
 def _bodies(result: Result) -> Iterator[Finding]:
@@ -158,50 +177,22 @@ def _remedy(result: Result, level: Level = "care") -> str:
 
 
 def _added(suggestion: Suggestion) -> str:
-    """The action that adds a suggested term."""
+    """The action that adds a suggested term, or makes a constant a parameter."""
+    if suggestion.option:
+        return f"make the {suggestion.name} a parameter: identify again with {suggestion.option}"
     return f"add the {suggestion.name or suggestion.kind}: identify again with --with-suggestions"
 
 
-def _simulation(result: Result) -> Iterator[Finding]:
-    """Errors of the simulations relative to the signals' ranges, of the worst log.
-
-    Where the method restarts simulations, one of a whole log needs care at worst, because unmodelled forces accumulate
-    in it.
-    """
-    logs, restarts = result.logs, result.separates_forces
-    for one, found in _predicted(logs):
-        if np.isfinite(found.divergence):
-            where = f" in {one.source}" if len(logs) > 1 else ""
-            yield Finding(
-                "bad" if np.isfinite(found.restart_period) or not restarts else "care",
-                f"The simulation diverges at t = {number(found.divergence)} s{where}",
-                _remedy(result, "bad"),
-            )
-    scored = [x for x in _predicted(logs) if not np.isfinite(x[1].divergence) and x[1].relative_errors]
-    if scored:
-        one, found = max(scored, key=lambda x: max(x[1].relative_errors.values()))
-        yield _median_error(result, found, _worst_of(one, logs))
-    if any(one.prediction is None for one in logs):
-        yield Finding("care", "No simulation is compared with the log, because its initial state is missing", VALIDATE)
-
-
-def _median_error(result: Result, found: Prediction, where: str) -> Finding:
-    """Finding on the signal with the largest median error of a simulation."""
-    errors = found.relative_errors
-    name, restarted = max(errors, key=lambda n: errors[n]), bool(np.isfinite(found.restart_period))
-    level = graded(errors[name], _NEAR, FAR)
-    what = share(errors[name], "its range")
-    if restarted:
-        method = f"simulations restarted every {number(found.restart_period)} s"
-        what = f"{what} in excess of the noise"
-        if not errors[name]:
-            return Finding(level, f"Median error of {method}: within the noise, in every signal.")
-    else:
-        method = "one simulation of the whole log"
-        level = "care" if result.separates_forces and level == "bad" else level
-    others = "the other scored signals are closer" if len(errors) > 1 else "no other signal is scored"
-    claim = f"Median error of {method}: {name} is off by {what}; {others}{where}"
-    return Finding(level, f"{claim}.") if level == "good" else Finding(level, claim, _remedy(result, level))
+def _predictions(result: Result, found: Predictions | None, action: str) -> Iterator[Finding]:
+    """Findings on open-loop predictions of the logs."""
+    if found is None:
+        yield Finding("care", "No prediction is compared with the log", VALIDATE)
+        return
+    worst = max(found.judged.relative_error.values(), default=0.0)
+    yield from findings_of_predictions(found, action or _remedy(result, graded(worst, NEAR, FAR)))
+    if found is result.predictions:
+        which = "the logs" if len(result.logs) > 1 else "the log"
+        yield Finding("note", f"Evaluated on {which} of the identification; held-out data are a stricter test.")
 
 
 def _predicted(logs: Sequence[LogSummary]) -> list[tuple[LogSummary, Prediction]]:
@@ -229,7 +220,7 @@ def _inliers(result: Result) -> Iterator[Finding]:
         return
     if fraction < _HALF:
         claim = f"{text} the simulation, which is less than half of the log"
-        yield Finding("bad", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
+        yield Finding("care", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
     if fraction >= 0.7:
         yield Finding("good", f"{text} the simulation.")
@@ -305,7 +296,9 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     left = found.unexplained[name]
     others = ", less of the others" if len(found.unexplained) > 1 else ""
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
-    level = graded(left, _NEAR, _HALF)
+    # Forces that predictions do not show, as those of vibrations, need care at worst.
+    shown = result.predictions is None or max(result.predictions.judged.relative_error.values(), default=np.inf) > FAR
+    level = graded(left, _LITTLE, _HALF if shown else np.inf)
     yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
 
 
@@ -405,6 +398,21 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
 # ---------------------------------------------------------------------- search and logs
 
 
+def noticed_disagreements(result: Result) -> list[tuple[Disagreement, Level]]:
+    """Parts of the logs that give other parameters, with their levels, as far as a user would notice."""
+    intervals = result.structural_intervals() if result.has_structure else result.intervals()
+    found = []
+    for one in result.estimate.disagreements:
+        moved, width = 0.0, np.inf
+        if one.name in intervals:
+            low, high = intervals[one.name]
+            moved, width = abs(one.parameters[one.name] - result.parameters[one.name]), high - low
+        level = level_of_disagreement(one, moved, width)
+        if level is not None:
+            found.append((one, level))
+    return found
+
+
 def _search(result: Result) -> Iterator[Finding]:
     if result.stop_reason == TIME_LIMIT:
         yield Finding("care", "The time limit ended the search; parameters are the best so far", "give a longer limit")
@@ -418,15 +426,11 @@ def _search(result: Result) -> Iterator[Finding]:
 
 
 def _logs(result: Result) -> Iterator[Finding]:
-    """Logs that disagree with the others, excluded rows, and the use of the logs."""
-    for one in result.logs:
-        if one.remark:
-            advice = "leave this log out, or give what differs a value per log"
-            yield Finding("bad", f"{one.remark}. One set of parameters does not describe all logs", advice)
+    """Parts of the logs and logs that disagree with the others, and excluded rows."""
+    for one, level in noticed_disagreements(result):
+        effect = "" if np.isnan(one.effect) else f", which changes predictions by {percent(one.effect)} of the motion"
+        yield Finding(level, f"{one.claim}{effect}", one.action)
     n_excluded = sum(found.n_excluded for _, found in _predicted(result.logs))
     if n_excluded:
         total = plural(sum(one.n_rows for one in result.logs), "row")
         yield Finding("note", f"{n_excluded:,} of {total} are excluded: a required signal is missing there.")
-    which = "the logs" if len(result.logs) > 1 else "the log"
-    text = f"Evaluated on {which} of the identification; held-out data are a stricter test."
-    yield Finding("note", text)

@@ -163,12 +163,6 @@ class SimulatedLog:
         """Number of rows in which a required signal is missing, or that no simulation covers."""
         return len(self.observations) - self.observations.n_rows + self.observations.offset
 
-    @property
-    def divergence(self) -> float:
-        """Time of the log at which the simulation becomes infinite, s; infinite if it does not."""
-        lost = ~np.isfinite(self.simulated).all(axis=1) & ~self.observations.gaps
-        return float(self._time(int(np.argmax(lost)))) if lost.any() else np.inf
-
     @cached_property
     def regular_errors(self) -> dict[str, FloatArray]:
         """Absolute errors of each signal over the rows that count, without outliers; infinite after a divergence."""
@@ -196,25 +190,6 @@ class SimulatedLog:
             found[name] = float(met.min(initial=low)), float(met.max(initial=high))
         return found
 
-    @property
-    def relative_errors(self) -> dict[str, float]:
-        """Median error of each signal with a threshold, less the noise's if known, over the signal's range."""
-        widths = {n: high - low for n, (low, high) in self.ranges.items()}
-        scored = [n for n, x in zip(self.observations.signals, self.thresholds, strict=True) if x > 0.0]
-        return {n: self._excess(n, widths[n]) / widths[n] for n in scored if widths[n] > 0.0}
-
-    def _excess(self, name: str, width: float) -> float:
-        """Median error of a signal, less the noise's.
-
-        Noise of more than half the range is misfit, since that of any signal is less than the range of its samples.
-        Then nothing is subtracted, and no sample is taken for an outlier.
-        """
-        noise = self.noise.get(name, 0.0)
-        if noise <= 0.5 * width:
-            median_of_noise = 0.6745 * noise  # the absolute value of Gaussian noise
-            return max(0.0, self.median_errors[name] - median_of_noise)
-        return float(np.median(self._absolute_errors(name, np.ones_like(self.inliers))))
-
     def windows(self) -> tuple[IntArray, FloatArray]:
         """Edges ``(n + 1,)`` of up to 40 windows over the rows, and their inlier fractions ``(n,)``."""
         n, valid = len(self.observations), self.observations.valid
@@ -228,9 +203,6 @@ class SimulatedLog:
         low = int(np.nanargmin(fractions))
         begin, end = (self._time(0) + self.observations.log.dt * float(x) for x in edges[low : low + 2])
         return Prediction(
-            restart_period=self.restart_period,
-            divergence=self.divergence,
-            relative_errors=self.relative_errors,
             unexplained={} if diagnosis is None else unexplained(diagnosis, self),
             n_rows=self.observations.n_rows,
             n_excluded=self.n_excluded,

@@ -60,6 +60,8 @@ class CandidateTerm:
         Name in an engineer's words, such as ``dry friction of x``.
     also : mapping of str to str, optional
         Further equations in which the term acts, and their code.
+    option : str, optional
+        Option that makes a constant of the model a parameter, in place of code.
     """
 
     kind: str
@@ -73,6 +75,7 @@ class CandidateTerm:
     bounds: tuple[float, float] = (-np.inf, np.inf)
     name: str = ""
     also: Mapping[str, str] = field(default_factory=dict)
+    option: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -180,7 +183,7 @@ class CandidateTerms:
         h = ca.Function("term", list(self.symbols), [ca.densify(term.residuals)], list("qvaup"), ["h"])
         return Suggestion(
             term.kind, term.equation, text, term.parameter, value, error, term.unit, explained,
-            term.code, expressions.stored(f"term {term.parameter}", h), term.name, term.also, others,
+            term.code, expressions.stored(f"term {term.parameter}", h), term.name, term.also, others, term.option,
         )  # fmt: skip
 
 
@@ -234,6 +237,7 @@ def candidate_terms(
     maker = _Maker(model, symbols, speeds, inputs)
     terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
     terms += [x for one in relative for x in maker.between(one)]
+    terms += maker.of_held()
     if library is not None:
         terms += maker.of_user(library)
     return CandidateTerms(symbols, (*terms, *maker.of_inputs()))
@@ -335,6 +339,8 @@ class _Maker:
         slow = float(f"{0.01 * place.motion.speed:.1g}")
         sign, smooth = ca.tanh(v / slow), f"ca.tanh({_single(code)} / {slow:g})"
         yield self._term("Coulomb friction", place, "coulomb", _Expression(sign, f"sign({name})", smooth, ""))
+        if np.count_nonzero(place.motion.velocities) == 1:
+            yield from self._of_load(place, _Expression(sign, f"sign({name})", smooth, ""))
         yield self._term("viscous friction", place, "viscous", _power(speed, 1))
         drag = f"|{name}| {_single(name)}", f"ca.fabs({code}) * {_single(code)}", f"({unit})^2"
         yield self._term("quadratic drag", place, "quadratic", _Expression(ca.fabs(v) * v, *drag))
@@ -376,6 +382,31 @@ class _Maker:
             formula, code = f"{signals[j]} {signals[k]}", f"v.{rates[j]} * v.{rates[k]}"
             product = _Expression(v[j] * v[k], formula, code, f"({units[j]}) ({units[k]})")
             yield self._term("product of velocities", place, f"product_{rates[j]}_{rates[k]}", product)
+
+    def of_held(self) -> Iterator[CandidateTerm]:
+        """Changes of the constants that the model holds, such as masses of bodies."""
+        for x in self.model.held:
+            h = x.effect(*self.symbols[:4])
+            acts = self.model.rate_names[h.sparsity().row()[0]]
+            called = KINDS[x.kind][0].format(x=x.place)
+            label, bounds = self._free(x.label), (x.least, np.inf)
+            yield CandidateTerm(x.kind, acts, x.place, "", "", label, x.unit, h, bounds, called, option=x.option)
+
+    def _of_load(self, place: _Place, sign: _Expression) -> Iterator[CandidateTerm]:
+        """Friction that is proportional to the force of the drives in the equation, as that of gears is."""
+        u, i = self.symbols[3], int(np.flatnonzero(place.motion.velocities)[0])
+        slopes = ca.jacobian(self.model.residual(*self.symbols)[i], u)
+        acting = slopes.sparsity().get_col()
+        if not acting or not slopes.is_constant():
+            return
+        names = [f"u.{list(self.model.inputs)[j]}" for j in acting]
+        factors = [float(slopes[0, j]) for j in acting]
+        load = " + ".join(f"{c!r} * {n}" for c, n in zip(factors, names, strict=True))
+        formula = f"|{names[0][2:] if len(names) == 1 else 'load'}| {sign.formula}"
+        value = ca.fabs(ca.dot(ca.DM(factors), ca.vertcat(*(u[j] for j in acting))))
+        friction = _Expression(value * sign.value, formula, f"ca.fabs({load}) * {sign.code}", "")
+        term = self._term("load-dependent friction", place, "load_friction", friction)
+        yield replace(term, unit="1")
 
     def of_user(self, library: TermLibrary) -> Iterator[CandidateTerm]:
         """The user's expressions in every equation."""

@@ -37,6 +37,9 @@ KINDS = {
     "linear term": ("decay of {x}", "a wider range of {place}"),
     "quadratic term": ("quadratic decay of {x}", "a wider range of {place}"),
     "constant term": ("constant rate of {x}", "a wider range of {place}"),
+    "mass of a body": ("mass of {x}", "accelerations and poses of {place} over a wider range"),
+    "inertia of a body": ("inertia of {x}", "larger accelerations of {place}, of both signs"),
+    "load-dependent friction": ("friction of {x} that grows with its load", "reversals of {place} under several loads"),
     "constant force": ("constant {force} {x}", "larger accelerations of {place}, of both signs"),
     "stiffness": ("spring on {x}", "a wider range of {place}"),
     "quadratic stiffness": ("quadratic spring on {x}", _RICHER),
@@ -302,6 +305,8 @@ class Suggestion:
         Further equations that lack the term, as one between two bodies, and their code.
     rivals : tuple of str, optional
         Names of terms that explain the same in its place, which the logs do not exclude.
+    option : str, optional
+        Option that makes a constant of the model a parameter, in place of code.
     """
 
     kind: str
@@ -317,6 +322,7 @@ class Suggestion:
     name: str = ""
     also: Mapping[str, str] = field(default_factory=dict)
     rivals: tuple[str, ...] = ()
+    option: str = ""
 
     @property
     def declaration(self) -> str:
@@ -326,6 +332,8 @@ class Suggestion:
     @property
     def change(self) -> str:
         """Change of the model, in a sentence."""
+        if self.option:
+            return f"identify again with {self.option} (bodies= of dr.models.robot)"
         where = (
             f"replace u.{self.equation} by"
             if self.kind in INPUT_CHANGES

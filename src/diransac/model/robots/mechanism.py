@@ -19,6 +19,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.derivation import Symbols
+from diransac.model.held import HeldConstant
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.robots.actuation import Actuation
@@ -92,7 +93,7 @@ class Mechanism:
             return [ca.cse(ca.vertcat(*forces.values()))]
 
         units = {n: ("rad", "N m") if self._joint(n).turns else ("m", "N") for n in self.coordinates}
-        return Model(
+        model = Model(
             name=self.description.name,
             description=f"robot with {len(units)} joints, from its description",
             coordinates={n: position for n, (position, _) in units.items()},
@@ -101,6 +102,36 @@ class Mechanism:
             parameters=self.parameters(driven),
             equations=equations,
         )
+        model.held_by = self.held
+        return model
+
+    def held(self, model: Model) -> list[HeldConstant]:
+        """Masses, at their centres, and inertias, about these, of the moving bodies that the description fixes.
+
+        Parameters
+        ----------
+        model : Model
+            Of this mechanism.
+        """
+        q, v, a, u, _ = symbols = [ca.SX.sym(n, size) for n, size in model.argument_sizes.items()]
+        named = model.named(*symbols)
+        base = [ca.vertcat(*(named[3][n] for n in names)) for names in self._base_inputs]
+        fixed = [i for i, x in enumerate(self.description.bodies) if i not in self.bodies and x.inertial[3, 3] > 0.0]
+        changes = {i: ca.SX.sym(f"changes_{i}", 2) for i in fixed}
+        everything = ca.vertcat(*changes.values())
+        values = {n: x.value for n, x in self.nominal.items()}
+        forces = self.forces(named[0], named[1], named[2], values, base, changes)
+        effects = ca.jacobian(ca.vertcat(*forces.values()), everything)
+        found = []
+        for k, i in enumerate(fixed):
+            body, mass = self.description.bodies[i].name, float(self.description.bodies[i].inertial[3, 3])
+            for j, (kind, unit, least) in enumerate((("mass", "kg", -mass), ("inertia", "1", -1.0))):
+                h = effects[:, 2 * k + j]
+                if h.nnz():
+                    effect = ca.Function("effect", [q, v, a, u], [ca.densify(h)])
+                    label, option = f"{kind}_change_{identifier(body)}", f"--bodies {body}"
+                    found.append(HeldConstant(f"{kind} of a body", body, label, unit, option, least, effect))
+        return found
 
     @property
     def _base_inputs(self) -> list[list[str]]:
@@ -189,10 +220,25 @@ class Mechanism:
 
     # ------------------------------------------------------------------ forces
 
-    def forces(self, q: Any, v: Any, a: Any, values: Mapping[str, Any], base: Sequence[ca.SX]) -> dict[str, Any]:
-        """Force that a motion takes, by coordinate, with values of the `nominal` parameters, and of a measured base."""
+    def forces(
+        self,
+        q: Any,
+        v: Any,
+        a: Any,
+        values: Mapping[str, Any],
+        base: Sequence[ca.SX],
+        changes: Mapping[int, ca.SX] | None = None,
+    ) -> dict[str, Any]:
+        """Force that a motion takes, by coordinate, with values of the `nominal` parameters, and of a measured base.
+
+        ``changes`` are those of the mass of some bodies at its centre, kg, and of the inertia about it, over its value.
+        """
         motions = self._motions(q, v, a)
         inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
+        for i, (mass, inertia) in ((i, ca.vertsplit(x)) for i, x in (changes or {}).items()):
+            J = self.description.bodies[i].inertial
+            point = np.outer(J[:, 3], J[:, 3]) / J[3, 3] ** 2
+            inertials[i] = J + mass * ca.DM(point) + inertia * ca.DM(J - J[3, 3] * point)
         q, v, a = ([x[k] for x in motions] for k in range(3))
         of_joints = inverse_dynamics(self.description, q, v, a, inertials, base)
         forces: dict[str, Any] = dict.fromkeys(self.coordinates, ca.SX(0))

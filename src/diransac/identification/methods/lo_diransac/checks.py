@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diransac.identification.estimate import Disagreement
 from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
+    from diransac.arrays import FloatArray
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.parts import Parts
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
@@ -88,23 +90,35 @@ def _shifted(names: Sequence[str], delay: float) -> str:
     return f"correct it where other programs read the log: --shift {','.join(f'{n}={-delay:.4g}' for n in names)}"
 
 
-def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
-    """Parameters that change during the log, and parts of it that the others do not predict."""
+def disagreements_of(names: Sequence[str], parts: Parts, parameters: FloatArray) -> Iterator[Disagreement]:
+    """Parameters that change during the log.
+
+    Parameters
+    ----------
+    names : sequence of str
+    parts : Parts
+        Result of `compared_parts`.
+    parameters : (n,) array
+        The answer.
+    """
     for change in parts.changes:
-        first, second = number(change.first, 3), number(change.second, 3)
-        text = f"{names[change.index]} changes during the log, from {first} in its first half to {second} in its second"
-        text = f"{text}, as by a payload, a drifting gain or another regime"
-        is_serious = change.is_large and parts.fail_elsewhere
-        advice = "identify stretches of the log one by one, with --from and --until"
-        yield Finding("bad" if is_serious else "care", text, advice)
+        k, first, second = change.index, number(change.first, 3), number(change.second, 3)
+        text = f"{names[k]} changes during the log, from {first} in its first half to {second} in its second"
+        half = change.halves[int(np.argmax(np.abs(change.halves[:, k] - parameters[k])))]
+        yield Disagreement(
+            f"{text}, as by a payload, a drifting gain or another regime",
+            "identify stretches of the log one by one, with --from and --until",
+            names[k],
+            dict(zip(names, half.tolist(), strict=True)),
+        )
+
+
+def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
+    """Parts of the log that the others do not predict, or whose parameters scatter more than by noise."""
     if parts.fail_elsewhere:
         more = percent(np.sqrt(parts.held_out) - 1.0)
         text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
-        claim = f"{text}, so that what is estimated from one part fails in another"
-        if parts.changes:
-            yield Finding("care", claim, "identify stretches of the log one by one, with --from and --until")
-        else:
-            yield Finding("note", f"{claim}.")
+        yield Finding("note", f"{text}, so that what is estimated from one part fails in another.")
     found = parts.deviation
     if found is not None:
         where = f"most between {percent(found.begin)} and {percent(found.end)} of its duration"

@@ -21,7 +21,7 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.checks import findings_of_fit
+from diransac.identification.methods.lo_diransac.checks import disagreements_of, findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
 from diransac.identification.methods.lo_diransac.input_noise import with_accelerations
@@ -257,10 +257,11 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
         *_checks_of_unmeasured(dataset, best),
         *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
     )
+    disagree = tuple(disagreements_of(dataset.layout.names, parts, result.parameters))
     found = _Found(dataset, best, result, ambiguity, candidates, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
-    return _estimate(settings, found, end, checks)
+    return replace(_estimate(settings, found, end, checks), disagreements=disagree)
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:

@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-# A difference of parameters: so many standard errors, and this part of the parameter; from the second on it is serious,
-# if held-out parts of the logs are predicted worse for it.
-_CLEAR, _DIFFERENT, _SERIOUS = 4.0, 0.03, 0.05
+# A difference of parameters: so many standard errors, and this part of the parameter.
+_CLEAR, _DIFFERENT = 4.0, 0.03
 # Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over what it is for
 # parameters that do not change, from which on it is no chance; standard errors by which the parameter that changed most
 # differs then, and probability that any of the others differs as much by chance.
@@ -47,7 +46,7 @@ _TINY = 1e-300
 _FEWEST_INTERVALS = 9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Change:
     """A parameter that differs between the halves of the logs: a payload, a battery, a machine that wears.
 
@@ -55,23 +54,27 @@ class Change:
     ----------
     index : int
         Of the parameter.
-    first, second : float
-        Its value in each half, its unit.
+    halves : (2, n) array
+        All parameters of each half.
     """
 
     index: int
-    first: float
-    second: float
+    halves: FloatArray
+
+    @property
+    def first(self) -> float:
+        """Its value in the first half, its unit."""
+        return float(self.halves[0, self.index])
+
+    @property
+    def second(self) -> float:
+        """Its value in the second half, its unit."""
+        return float(self.halves[1, self.index])
 
     @property
     def apart(self) -> float:
         """Difference over the mean of both."""
         return abs(self.first - self.second) / max(0.5 * (abs(self.first) + abs(self.second)), _TINY)
-
-    @property
-    def is_large(self) -> bool:
-        """True for a difference that is serious if held-out parts of the logs are predicted worse for it."""
-        return self.apart > _SERIOUS
 
     @property
     def variance(self) -> float:
@@ -159,7 +162,7 @@ def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate,
     apart[np.isinf(np.diag(result.covariance))] = 0.0
     changed = np.abs(apart) > _clear(apart, held_out)
     halves = result.parameters + moved
-    both = [Change(int(k), *halves[:, k].tolist()) for k in np.flatnonzero(changed)]
+    both = [Change(int(k), halves) for k in np.flatnonzero(changed)]
     return Parts([x for x in both if x.apart > _DIFFERENT], held_out)
 
 

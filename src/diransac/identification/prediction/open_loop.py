@@ -12,72 +12,21 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, interpolated, runs,
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
 from diransac.errors import LogError
-from diransac.identification.assessment.window_starts import SmoothedLog, WindowStarts
 from diransac.identification.diagnosis import Resolution
+from diransac.identification.estimate import HorizonScores
 from diransac.identification.evaluation.simulation import Simulation
+from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.methods.lo_diransac.segments import OUTLYING
+from diransac.identification.prediction.starts import SmoothedLog, StartEstimator, followed_log, smoothed_log
 from diransac.identification.regression.multistart import least_squares
 from diransac.identification.regression.observers import driven_states
 from diransac.model import Model
 
 StartRule = Literal["smoothed", "measured"]
 
-
-@dataclass(frozen=True)
-class HorizonScores:
-    """Open-loop prediction at one horizon, by signal.
-
-    Robust scores leave out outliers: samples further than six standard deviations of the noise from the motion as it
-    is smoothed without the model, so that no error of the model is one.
-
-    Parameters
-    ----------
-    horizon : float
-        Time after which the simulation restarts, s; infinite: never.
-    windows : int
-        Number of simulations that were scored.
-    diverged : int
-        Number of simulations that became infinite, which makes the scores infinite.
-    rmse : mapping of str to float
-        Root mean squared error of each signal, its unit.
-    fit_percent : mapping of str to float
-        ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
-    r_squared : mapping of str to float
-        ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``.
-    robust_rmse, robust_fit_percent, robust_r_squared : mapping of str to float
-        The same without outliers.
-    hold_last : mapping of str to float
-        RMSE, without outliers, of the prediction that nothing changes after the start of a window.
-    constant_velocity : mapping of str to float
-        RMSE, without outliers, of the prediction that every coordinate goes on at the velocity of the start.
-    relative_error : mapping of str to float
-        Of each state and sensor that moves: RMSE in excess of the noise and of the effect of uncertain starts, over the
-        excess of the better of these two predictions.  0: perfect; 1: no better than a trivial prediction.
-    sensitivity : mapping of str to float
-        Of each state and sensor that moves: RMS effect on the prediction of 1 % changes of the parameters, of random
-        signs, and of uncertain starts, over the same excess.
-    of_starts : mapping of str to float
-        The part of uncertain starts in it, an error up to which cannot be seen.
-    """
-
-    horizon: float
-    windows: int
-    diverged: int
-    rmse: Mapping[str, float]
-    fit_percent: Mapping[str, float]
-    r_squared: Mapping[str, float]
-    robust_rmse: Mapping[str, float]
-    robust_fit_percent: Mapping[str, float]
-    robust_r_squared: Mapping[str, float]
-    hold_last: Mapping[str, float]
-    constant_velocity: Mapping[str, float]
-    relative_error: Mapping[str, float]
-    sensitivity: Mapping[str, float]
-    of_starts: Mapping[str, float]
-
-    @property
-    def name(self) -> str:
-        """The horizon in words."""
-        return "whole log" if np.isinf(self.horizon) else f"{self.horizon:g} s"
+_ROUNDS = 3
+_MOST_ROWS = 200_000
+"""Rows of a stretch that windows of a horizon predict, about; of longer ones every other window is enough."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +78,8 @@ class OpenLoop:
     resolution : Resolution
     start : {"smoothed", "measured"}
         Rule of the initial states.
+    noise : mapping of str to float, optional
+        Noise of signals by an identification, which separates it from what the model lacks: upper bounds.
 
     Raises
     ------
@@ -143,51 +94,82 @@ class OpenLoop:
         parameters: Mapping[str, float],
         resolution: Resolution,
         start: StartRule = "smoothed",
+        noise: Mapping[str, float] | None = None,
     ) -> None:
         layout = ParameterLayout(dataset.model.parameters)
         alone = replace(dataset, segments=(dataset.segments[log],), given=(dataset.given[log],), layout=layout)
+        self._alone, self.resolution = alone, resolution
         self.segment: Segment = alone.segments[0]
         self.simulation = Simulation(alone, resolution=resolution)
         self.parameters = dataset.model.parameter_vector(parameters)
         self.smoothed = _smoothed(alone, self.parameters, resolution) if start == "smoothed" else None
+        if self.smoothed is not None and noise:
+            most = np.array([noise.get(name, np.inf) for name in self.segment.signals])
+            self.smoothed = replace(self.smoothed, noise=np.fmin(self.smoothed.noise, most))
         self.states = _states(self.segment, layout, self.parameters, self.smoothed)
-        n_s = self.segment.measured.shape[1]
-        found = self.smoothed
+        n_s, found = self.segment.measured.shape[1], self.smoothed
         self.outliers: BoolArray = np.zeros(self.segment.measured.shape, bool) if found is None else found.outliers
+        self.noise = np.zeros(n_s) if found is None else found.noise
+        self._estimator = None
+        if found is not None and found.intervals is not None:
+            filled = self.filled_states()
+            self._estimator = StartEstimator.of(found, self.segment, self.parameters, resolution, filled)
+        n_before = 0 if self._estimator is None else self._estimator.n_before
         complete: BoolArray = np.asarray(np.isfinite(self.states).all(axis=1))
-        parts = [x for x in runs(~self.segment.gaps) if complete[x.start : x.stop - 1].any()]
+        begins = [slice(x.start + n_before, x.stop) for x in runs(~self.segment.gaps)]
+        parts = [x for x in begins if complete[x.start : x.stop - 1].any()]
         self.stretches = [slice(x.start + int(np.argmax(complete[x])), x.stop) for x in parts]
         self._complete = complete
         if not parts:
             needed = ", ".join(dataset.model.states_behind(self.segment.present))
             raise LogError(f"{self.segment.log.source}: no row has a complete state ({needed}) to start from")
-        self.noise = self._noise() if found is not None else np.zeros(n_s)
+        if self._estimator is not None:
+            self._estimator = self._refined(self._estimator)
 
-    def _noise(self) -> FloatArray:
-        """Noise ``(n_s,)``: the lesser of the samples' deviations from the smoothed motion, and from short simulations.
+    def _refined(self, estimator: StartEstimator) -> StartEstimator:
+        """Noise and outliers by short simulations that follow the samples, too; starts that predict best.
 
-        The one holds errors of the smoothed motion besides noise, the other those of the model, less what the fit of
-        their starts takes of few samples.
+        The smoothed motion has errors besides noise, simulations those of the model, less what the fit of their starts
+        takes of few samples: noise is the lesser, and an outlier far from both.  Starts from few samples have their
+        noise, those from many what the model lacks: those are used from which the rows after them are predicted best.
         """
         assert self.smoothed is not None
-        if not self.segment.model.has_equations:
-            return self.smoothed.noise
-        stretch = max(self.stretches, key=lambda x: x.stop - x.start)
-        # Forty short simulations are enough.
-        every = max(1, (stretch.stop - stretch.start) // 40)
-        rows = np.arange(stretch.start, stretch.stop, every)
-        samples = self.smoothed.samples
+        n, columns = estimator.n_before, [self.segment.model.signals.index(x) for x in self.segment.signals]
+        ends = np.concatenate([np.append(np.arange(x.start, x.stop, n), x.stop) for x in self.stretches])
+        smooth = self.outliers
+        # Scales depend on starts, and these on scales: after three rounds they hardly change.
+        for k in range(_ROUNDS):
+            errors, scale, noise = self._short_errors(estimator, ends, fitted=k > 0)
+            near = np.zeros(smooth.shape, bool)
+            np.logical_or.at(near, ends[:, None] + np.arange(-n, 0), np.abs(errors) <= OUTLYING * scale)
+            self.outliers = smooth & ~near
+            self.noise = np.fmin(self.smoothed.noise, noise)
+            estimator = estimator.refined(columns, self.noise, scale, self.outliers)
+        rows, tried = ends[ends + n < len(self.segment)], estimator.shorter()
+        for x in tried[1:]:  # of which the model lacks less
+            self.noise = np.fmin(self.noise, self._short_errors(x, ends, fitted=True)[2])
+        tried = [x.refined(columns, self.noise, scale, self.outliers) for x in tried]
+        return min(tried, key=lambda x: self._misses(x, rows, n)) if len(rows) and len(tried) > 1 else tried[0]
+
+    def _short_errors(
+        self, estimator: StartEstimator, ends: IntArray, *, fitted: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Errors ``(K, n, n_s)`` of simulations before some rows, their scale without outliers, and the noise in it."""
+        columns, n = [self.segment.model.signals.index(x) for x in self.segment.signals], estimator.n_before
+        errors = estimator.errors(ends, fitted=fitted)[:, :, columns]
+        outliers = self.outliers[ends[:, None] + np.arange(-n, 0)]
+        known, scale = _known_scale(np.where(outliers, np.nan, errors))
         # A short simulation fits two numbers to the samples of a signal.
+        samples = known.mean(axis=(0, 1)) * n
         freedom = np.where(samples > 4.0, 1.0 - 2.0 / np.maximum(samples, 4.0), np.nan)
-        return np.fmin(self.smoothed.noise, self._estimated(stretch, rows).residual / np.sqrt(freedom))
+        return errors, scale, scale / np.sqrt(freedom)
 
-    def _estimated(self, stretch: slice, rows: IntArray) -> WindowStarts:
-        """Estimated initial states of windows from some rows of a stretch."""
-        from diransac.identification.assessment.window_starts import window_starts  # which needs all of lo-diransac
-
-        assert self.smoothed is not None
-        filled, measured = self.filled_states(), self.segment.measured
-        return window_starts(self.simulation, self.parameters, filled, self.smoothed, measured, stretch, rows)
+    def _misses(self, estimator: StartEstimator, rows: IntArray, steps: int) -> float:
+        """Sum over the signals of the logarithms of robust errors of short predictions from some rows."""
+        found = self._errors(self.parameters, estimator.at(rows)[0], rows, steps)
+        measured = self.segment.measured[rows[:, None] + np.arange(1, steps + 1)]
+        _, scale = _known_scale(np.where(np.isfinite(measured), found, np.nan))
+        return float(np.log(scale[np.isfinite(scale) & (scale > 0.0)]).sum())
 
     @property
     def duration(self) -> float:
@@ -205,25 +187,21 @@ class OpenLoop:
         """Samples of a horizon; 0 where no stretch of the log is longer than that."""
         return max(self._steps(x, horizon) for x in self.stretches)
 
-    def starts(self, stretch: slice, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    def starts(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """Initial states ``(K, n_x)`` of windows from some rows, and their standard deviations ``(K, n_x, n_x)``."""
-        if self.smoothed is None or not self.segment.model.has_equations:
-            found = self.states[rows]
-            return found, np.zeros((*found.shape, found.shape[1]))
-        one = self._estimated(stretch, rows)
-        return one.states, one.deviations
+        if self._estimator is not None:
+            return self._estimator.at(rows)
+        found = self.states[rows]
+        return found, np.zeros((*found.shape, found.shape[1]))
 
     def filled_states(self) -> FloatArray:
         """States ``(N, n_x)`` at all rows, interpolated where there is none."""
         return interpolated(self.states)
 
-    def window_rows(self, steps: int) -> list[tuple[slice, IntArray]]:
+    def window_rows(self, steps: int) -> IntArray:
         """First rows of windows of so many samples, one after another, and of the rest, in each stretch."""
-        found = []
-        for part in self.stretches:
-            rows = np.arange(part.start, part.stop, steps)
-            found.append((part, rows[self._complete[rows]]))
-        return found
+        rows: IntArray = np.concatenate([np.arange(x.start, x.stop, steps) for x in self.stretches])
+        return rows[self._complete[rows]]
 
     def sums(self, horizon: float) -> _Sums:
         """Sums over the windows of one horizon in all stretches between gaps."""
@@ -232,11 +210,10 @@ class OpenLoop:
 
     def _sums(self, rows: slice, steps: int) -> _Sums | None:
         """Sums over windows, one after another, from complete states; None without any."""
-        begins = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
-        begins = begins[self._complete[begins]]
+        begins = self._begins(rows, steps)
         if not len(begins):
             return None
-        states, deviations = self.starts(rows, begins)
+        states, deviations = self.starts(begins)
         at = begins[:, None] + np.arange(1, steps + 1)
         measured, outliers = self.segment.measured[at], self.outliers[at]
         errors = self._errors(self.parameters, states, begins, steps)
@@ -259,6 +236,41 @@ class OpenLoop:
             measured=measured.reshape(-1, measured.shape[2]),
             outliers=outliers.reshape(-1, measured.shape[2]),
         )
+
+    def _begins(self, rows: slice, steps: int) -> IntArray:
+        """First rows of the windows of so many samples that are scored in a stretch."""
+        begins = np.arange(rows.start, rows.stop - steps, steps) if steps else np.arange(0)
+        begins = begins[self._complete[begins]]
+        return begins[:: max(1, -(-len(begins) * steps // _MOST_ROWS))]
+
+    def change(self, horizon: float, parameters: FloatArray, delay: float = 0.0) -> float:
+        """Largest RMS change of a moving state's prediction by other parameters ``(n_p,)`` and a further delay, s.
+
+        It is relative to the excess of the better trivial prediction, as `HorizonScores.relative_error`; 0 below the
+        noise.
+        """
+        timing = self.resolution.timing
+        later = replace(self.resolution, timing=replace(timing, delay=timing.delay + delay))
+        simulation = Simulation(self._alone, resolution=later) if delay else self.simulation
+        total, n = np.zeros((3, self.segment.measured.shape[1])), np.zeros(self.segment.measured.shape[1])
+        for rows in self.stretches:
+            steps = self._steps(rows, horizon)
+            begins = self._begins(rows, steps)
+            if not len(begins):
+                continue
+            states, at = self.starts(begins)[0], begins[:, None] + np.arange(1, steps + 1)
+            measured, regular = self.segment.measured[at], np.isfinite(self.segment.measured[at]) & ~self.outliers[at]
+            other = simulation.errors(0, parameters, states, begins, steps + 1)[:, 1:]
+            moved = other - self._errors(self.parameters, states, begins, steps)
+            trivial = [x - measured for x in self._trivial(states, begins, steps)]
+            total += np.array([_squares(x, regular) for x in (moved, *trivial)])
+            n += regular.sum(axis=(0, 1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved, held, uniform = total / n
+        trivial, noise = np.fmin(held, uniform), np.square(self.noise)
+        is_state = np.array([x in self.segment.model.state for x in self.segment.signals])
+        seen = is_state & _moves(trivial, noise) & (moved > noise)
+        return float(np.sqrt(moved[seen] / (trivial - noise)[seen]).max(initial=0.0))
 
     def _errors(self, parameters: FloatArray, states: FloatArray, rows: IntArray, steps: int) -> FloatArray:
         """Simulated less measured signals ``(K, steps, n_s)``, without the first row of each window."""
@@ -293,6 +305,18 @@ class OpenLoop:
                     of_starts += np.square(self._errors(self.parameters, shifted, rows, errors.shape[1]) - errors)
                 of_parameters += np.square(self._errors(changed, states, rows, errors.shape[1]) - errors)
         return np.sqrt(of_starts / len(signs)), np.sqrt(of_parameters / len(signs))
+
+
+def _known_scale(errors: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Errors ``(K, n, n_s)`` that are finite, and their robust scale ``(n_s,)``, infinite where too few are."""
+    known: BoolArray = np.isfinite(errors)
+    flat = np.where(known, errors, 0.0).reshape(-1, errors.shape[2])
+    return known, np.nan_to_num(lower_scale(flat, known.reshape(flat.shape)), nan=np.inf)
+
+
+def _moves(trivial: FloatArray, noise: FloatArray) -> BoolArray:
+    """Signals whose trivial predictions err by five standard deviations of the noise; arguments are mean squares."""
+    return np.asarray((trivial > 5.0**2 * noise) & (trivial > 0.0))
 
 
 def _squares(errors: FloatArray, counted: BoolArray) -> FloatArray:
@@ -335,8 +359,7 @@ def pooled_scores(signals: Sequence[str], horizon: float, logs: Sequence[OpenLoo
         ratio, robust_ratio = total.squared / spread, total.robust_squared / regular
         held, uniform, noise = total.held / count, total.uniform / count, total.of_noise / count
         trivial = np.fmin(held, uniform)
-        # A signal moves if trivial predictions err by ten standard deviations of its noise.
-        moves = judged & (trivial > 10.0**2 * noise) & (trivial > 0.0)
+        moves = judged & _moves(trivial, noise)
         excess = trivial - noise
         known = (total.of_noise + total.of_starts) / count
         error = np.sqrt(np.maximum(total.robust_squared / count - known, 0.0) / excess)
@@ -376,9 +399,6 @@ def _squares_about_mean(measured: FloatArray) -> FloatArray:
 
 def _smoothed(alone: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
     """One log, smoothed without the model, or followed by one without equations; None where it is too short."""
-    # These need all of lo-diransac.
-    from diransac.identification.assessment.window_starts import followed_log, smoothed_log
-
     return smoothed_log(alone) if alone.model.has_equations else followed_log(alone, parameters, resolution)
 
 
@@ -387,16 +407,17 @@ def _states(
 ) -> FloatArray:
     """The state ``(N, n_x)`` at every row, NaN where it is incomplete; 0 where nothing measured depends on it.
 
-    Smoothed states take the place of measured ones, and of velocities that the log lacks.  States of first order that
-    it lacks are simulated, driven by the others.
+    Smoothed states take the place of measured ones, and of velocities that the log lacks.  States that nothing measures
+    are simulated, driven by the others.
 
     Raises LogError: the log lacks another state on which a measured signal depends.
     """
     model, matter = segment.model, segment.model.states_behind(segment.present)
     if smoothed is not None and not model.has_equations:
         return smoothed.signals[:, : len(model.state)]
-    hidden = tuple(n for n in model.first_order if n in matter and n not in segment.present)
     derived = () if smoothed is None else derived_velocities(segment, matter)
+    lacking = [n for n in model.state if n in matter and n not in (*segment.present, *derived)]
+    hidden = tuple(n for n in lacking if smoothed is not None or n in model.first_order)
     given = dict.fromkeys((*hidden, *derived), 0.0)
     states = np.tile(segment.initial_state(given or "first"), (len(segment), 1))
     for i, name in enumerate(model.state):
