@@ -530,8 +530,9 @@ def test_positions_alone_are_simulated_from_the_smoothed_states(model, log, tmp_
     assert "method lo-diransac" in page.text
 
 
-@pytest.mark.parametrize(("size", "level"), [(0.0, "good"), (0.2, "care"), (2.0, "bad")])
-def test_the_unexplained_share_of_an_acceleration_is_graded(diagnosed, hit, size, level):
+@pytest.mark.parametrize(("size", "level"), [(0.0, "good"), (0.2, "care"), (2.0, "care")])
+def test_the_unexplained_share_of_an_acceleration_is_graded_but_predictions_decide(diagnosed, hit, size, level):
+    """Forces that no prediction shows, as those of vibration, need care at worst."""
     left = size * np.sqrt(np.mean(hit["x_ddot"] ** 2))
     latent = {"x_ddot": diagnosed.diagnosis.unmodelled_accelerations["x_ddot"] + left}
     pushed = changed(diagnosed, diagnosis=dataclasses.replace(diagnosed.diagnosis, unmodelled_accelerations=latent))

@@ -13,6 +13,7 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `regression/` | parameters from rows of equations |
 | `structure/` | what a model and a log determine; terms that a model may lack |
 | `evaluation/` | an estimate against its logs; findings |
+| `prediction/` | open-loop prediction of logs |
 | `methods/` | the methods |
 | `assessment/` | inspection of logs, validation of models |
 | `tracking/` | parameters of a machine while it runs |

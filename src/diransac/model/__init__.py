@@ -9,6 +9,7 @@ as CasADi functions, which everything else takes.  Begin with `model.py`.
 | `parameter.py`, `sensors.py` | `Parameter`; `Sensor`, and those of common instruments |
 | `derivation.py`, `expressions.py` | checks and symbolic parts of equations; expression graphs as plain data |
 | `plant.py` | `Plant`, a model with parameters, and `Disturbance` |
+| `held.py` | constants of a description that a model holds |
 | `parts.py` | independent parts of a model, such as limbs |
 | `library/` | the built-in models |
 | `robots/` | models from MJCF and URDF |

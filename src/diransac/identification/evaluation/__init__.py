@@ -8,5 +8,5 @@ a `Prediction` per log, logs that disagree, and the findings of a result.  Begin
 | `simulation.py`, `scoring.py` | simulations of a dataset; weights, thresholds, `evaluate` |
 | `prediction.py` | a simulation of each log, row by row |
 | `agreement.py` | logs that disagree with the others |
-| `findings.py` | findings of a result; the verdict follows from them |
+| `findings.py`, `verdict.py` | findings of a result; those of predictions, from which the verdict follows |
 """

@@ -1,4 +1,8 @@
-"""Open-loop prediction of logs: `starts` of windows, their scores in `open_loop`, which horizons are scored and judged.
+"""Open-loop prediction of logs, by which `identify` and `validate` score and judge alike.
 
-`identify` and `validate` score and judge by the same functions.
+| file | contents |
+|---|---|
+| `horizons.py` | the horizons that are scored, and the one that is judged |
+| `starts.py` | initial states of windows, from the samples before them |
+| `open_loop.py` | scores of predictions beside trivial ones |
 """

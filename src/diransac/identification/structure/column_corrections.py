@@ -313,11 +313,14 @@ def _several_signs(tests: CorrectionTests, best: CorrectedEquations) -> Iterator
 
 
 def _is_proved(tests: CorrectionTests, without: CorrectedEquations, best: CorrectedEquations) -> bool:
-    """True if the equations are explained, the log determines the factor, and no constant of the model takes it up."""
+    """True if the equations are explained, the log determines the factor, and no constant of the model takes it up.
+
+    Bounds determine it, too, where parameters are clearly outside of them as recorded.
+    """
     one, improved = best.correction, without.improved_by(best)
     if (best.residuals[improved] > _EXPLAINED).any():
         return False
-    if not one.unit:
+    if not one.unit or without.outside:
         return True
     for off in (_OFF, 1.0 / _OFF):
         factor = one.factor * off if not one.offset else one.factor

@@ -93,11 +93,13 @@ class Comparison:
         """Comparison of candidates."""
         forces = np.array([x.forces for x in scores])
         logs = _log_losses(scores, forces)
-        logs[_fails_absurdly(forces)] = np.inf
-        first = int(np.nanargmin(_overall(logs)))
+        absurd = _fails_absurdly(forces)
+        logs[absurd & ~absurd.all()] = np.inf
+        first = int(np.argmin(_overall(logs)))
         difference, error = _differences(logs, first)
         quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)
-        best = int(np.flatnonzero(difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING)[0])
+        as_well = difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING
+        best = int(np.argmax(as_well | (np.arange(len(logs)) == first)))
         difference, error = _differences(logs, best)
         z = np.nan_to_num(np.maximum(difference - _AS_WELL, 0.0) / (error + _ROUNDING), nan=np.inf)
         return cls(best, np.exp(-0.25 * np.square(z)), np.asarray(z <= quantile), np.exp(_overall(logs)))

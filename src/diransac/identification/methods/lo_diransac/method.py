@@ -27,7 +27,7 @@ from diransac.identification.methods.lo_diransac.diagnosing import by_accelerati
 from diransac.identification.methods.lo_diransac.input_noise import with_accelerations
 from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
-from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
+from diransac.identification.methods.lo_diransac.motion_equations import parameter_units, unexplained
 from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
@@ -401,7 +401,9 @@ def _diagnosis(
     intervals, fit = best.likeliest.intervals, best.likeliest.refinement.fit
     accelerations = [result.unexplained]
     if found.lacks and found.lacks.suggestions:
-        accelerations.append(found.lacks.accelerations)
+        # Parameters of the fit leave other forces than those of the answer, which change with the terms.
+        apart = result.unexplained - unexplained(intervals, fit, result.of_fit)
+        accelerations.append(found.lacks.accelerations + apart * (result.of_fit != result.parameters).any())
     forces = _forces_of(intervals, fit, result.parameters, accelerations)
     fitted, late = (fit.noise, fit.residuals, fit.x), best.common_timing
     input_noise = zip(intervals.model.inputs, best.likeliest.noise_of_inputs.tolist(), strict=True)
