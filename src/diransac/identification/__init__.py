@@ -14,6 +14,7 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `structure/` | what a model and a log determine; terms that a model may lack |
 | `evaluation/` | an estimate against its logs; findings |
 | `methods/` | the methods |
+| `prediction/` | open-loop prediction of logs, of `identify` and `validate` alike |
 | `assessment/` | inspection of logs, validation of models |
 | `tracking/` | parameters of a machine while it runs |
 """

@@ -9,4 +9,5 @@ a `Prediction` per log, logs that disagree, and the findings of a result.  Begin
 | `prediction.py` | a simulation of each log, row by row |
 | `agreement.py` | logs that disagree with the others |
 | `findings.py` | findings of a result; the verdict follows from them |
+| `verdict.py` | findings of open-loop predictions, the one rule of `identify` and `validate` |
 """
