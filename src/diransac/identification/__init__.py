@@ -15,6 +15,7 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `evaluation/` | an estimate against its logs; findings |
 | `prediction/` | open-loop prediction of logs |
 | `methods/` | the methods |
+| `prediction/` | open-loop prediction of logs, of `identify` and `validate` alike |
 | `assessment/` | inspection of logs, validation of models |
 | `tracking/` | parameters of a machine while it runs |
 """
