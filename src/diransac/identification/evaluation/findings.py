@@ -51,12 +51,12 @@ def findings_of(result: Result, predictions: Predictions | None = None, action: 
             *mistakes,
             *result.estimate.checks,
             *_logs(result),
-            *(Finding("care", f"The model seems to lack a term. {x.text}", _added(x)) for x in result.suggestions),
+            *_lacking(result, predicted := (*_predictions(result, predictions or result.predictions, action),)),
             *_bounds(result),
             *_diagnosis(result),
             *_bodies(result),
             *_known(result),
-            *_predictions(result, predictions or result.predictions, action),
+            *predicted,
             *_inliers(result),
             *_uncertainty(result),
             *_structure(result),
@@ -68,6 +68,14 @@ def findings_of(result: Result, predictions: Predictions | None = None, action: 
     if cause is None:
         return found
     return tuple(Finding(x.level, x.claim, cause.action) if x.action else x for x in found)
+
+
+def _lacking(result: Result, predicted: Sequence[Finding]) -> Iterator[Finding]:
+    """Terms that the model seems to lack: each as serious as the predictions that it would mend."""
+    bad = {x.action for x in predicted if x.level == "bad"}
+    for one in result.suggestions:
+        action = _added(one)
+        yield Finding("bad" if action in bad else "care", f"The model seems to lack a term. {one.text}", action)
 
 
 # ---------------------------------------------------------------------- bounds
