@@ -73,7 +73,9 @@ def end_search() -> None:
 def time_left() -> float:
     """Time until the limit, s; infinite where there is none."""
     deadline = _NEXT.get()
-    return -math.inf if _ENDED.is_set() and deadline is not _UNLIMITED else deadline.moment - monotonic()
+    if _ENDED.is_set() and deadline is not _UNLIMITED:
+        return -math.inf
+    return math.inf if math.isinf(deadline.moment) else deadline.moment - monotonic()
 
 
 def check_time() -> None:

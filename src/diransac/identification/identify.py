@@ -30,7 +30,7 @@ from diransac.identification.structure.refusal import check_motion
 from diransac.model import Model
 from diransac.process import single_threaded
 from diransac.simulation import HOLDS
-from diransac.time_limit import check_time, time_limited
+from diransac.time_limit import check_time, time_limited, time_unlimited
 
 
 def identify(
@@ -483,10 +483,11 @@ def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
     own, resolution = [result.parameters_in(log) for log in logs], result.estimate.resolution
     noise = None if result.diagnosis is None else result.diagnosis.noise_std
     try:
-        dataset = Dataset.of(result.model, logs, pointwise=False)
-        loops, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
-        effects = [effect_of(x, loops, found.judged.horizon) for x in result.estimate.disagreements]
-    except (LogError, TimeLimitError):
+        with time_unlimited(), np.errstate(all="ignore"):  # it completes an answer; what overflows predicts nothing
+            dataset = Dataset.of(result.model, logs, pointwise=False)
+            loops, found = predictions_of(dataset, own, resolution, result.options.get("horizon"), noise=noise)
+            effects = [effect_of(x, loops, found.judged.horizon) for x in result.estimate.disagreements]
+    except LogError:
         return result
     pairs = zip(result.estimate.disagreements, effects, strict=True)
     known = tuple(dataclasses.replace(x, effect=effect) for x, effect in pairs)

@@ -18,7 +18,7 @@ from diransac.identification.methods import DEFAULT
 from diransac.identification.result import Result
 from diransac.model import Model
 from diransac.text_table import aligned
-from diransac.time_limit import check_time, time_limited
+from diransac.time_limit import check_time, time_limited, time_unlimited
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,7 @@ def _fold(
     except DiransacError as error:
         return str(error), "no model of the other logs"
     try:
-        return result, validate(result, left_out, horizon)
+        with time_unlimited():
+            return result, validate(result, left_out, horizon)
     except DiransacError as error:
         return result, str(error)

@@ -19,7 +19,6 @@ from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.segments import OUTLYING
 from diransac.identification.prediction.starts import SmoothedLog, StartEstimator, followed_log, smoothed_log
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.observers import driven_states
 from diransac.model import Model
 
 StartRule = Literal["smoothed", "measured"]
@@ -136,7 +135,7 @@ class OpenLoop:
         assert self.smoothed is not None
         n, columns = estimator.n_before, [self.segment.model.signals.index(x) for x in self.segment.signals]
         ends = np.concatenate([np.append(np.arange(x.start, x.stop, n), x.stop) for x in self.stretches])
-        smooth = self.outliers
+        smooth = self._of_whole_quaternions(self.outliers)
         # Scales depend on starts, and these on scales: after three rounds they hardly change.
         for k in range(_ROUNDS):
             errors, scale, noise = self._short_errors(estimator, ends, fitted=k > 0)
@@ -150,6 +149,14 @@ class OpenLoop:
             self.noise = np.fmin(self.noise, self._short_errors(x, ends, fitted=True)[2])
         tried = [x.refined(columns, self.noise, scale, self.outliers) for x in tried]
         return min(tried, key=lambda x: self._misses(x, rows, n)) if len(rows) and len(tried) > 1 else tried[0]
+
+    def _of_whole_quaternions(self, outliers: BoolArray) -> BoolArray:
+        """The mask with all components of a quaternion of which one is an outlier, which may turn the sign of all."""
+        found, signals = outliers.copy(), self.segment.signals
+        for four in self.segment.model.quaternions:
+            own = [signals.index(n) for n in (self.segment.model.signals[k] for k in four) if n in signals]
+            found[:, own] = outliers[:, own].any(axis=1, keepdims=True)
+        return found
 
     def _short_errors(
         self, estimator: StartEstimator, ends: IntArray, *, fitted: bool
@@ -456,6 +463,8 @@ def _unmeasured(
     # The observers forget within a twentieth of the log.
     bandwidth = 1.0 / (0.05 * len(segment) * segment.log.dt)
     whole, alone = [slice(0, len(segment))], ParameterLayout(layout.parameters)
+    from diransac.identification.regression.observers import driven_states  # for states that nothing measures alone
+
     problem = driven_states(
         model, alone, hidden, known, segment.inputs, readings, weights, whole, segment.log.dt, bandwidth, parameters
     )
