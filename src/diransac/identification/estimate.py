@@ -361,7 +361,7 @@ class Predictions:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model leaves of one log.
+    """Accelerations of one log that the model does not explain, rows that count, and the weakest window.
 
     Parameters
     ----------
