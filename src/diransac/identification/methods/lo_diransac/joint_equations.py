@@ -140,7 +140,7 @@ class Columns:
         """Information ``(E, E)`` of the errors, if all else were known."""
         own = [[(at.weights * x * y).sum() for y in self.residuals] for x in self.residuals]
         by_jumps = np.einsum("wi,wie,wif->ef", at.precision, self.jumps, self.jumps)
-        return np.array(own).reshape(by_jumps.shape) + by_jumps
+        return np.asarray(np.array(own).reshape(by_jumps.shape) + by_jumps)
 
 
 Change = tuple[FloatArray, FloatArray]
