@@ -19,6 +19,9 @@ _MAX_TRIALS = 8
 _CORRECTED = 0.3
 """Largest part of the excess of cost that a correction for the curvature of the rollouts may leave."""
 _FIRST_DAMPING = 1e-7
+"""Damping of the first step that needs one."""
+_LEAST_DAMPING = 1e-9
+"""Damping below which there is none."""
 _ROUNDING = 1e-9
 """Relative change of the cost that is none."""
 
@@ -80,7 +83,7 @@ def gauss_newton_step(at: JointEquations, damping: float) -> Step:
             there, trial = at.moved(step)
             more = cost(there, trial, intervals.weights_in(there, weights)) - before
             if more <= _ROUNDING * before:
-                least = damping if trials else damping / 10.0 if damping > _FIRST_DAMPING else 0.0
+                least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
                 return Step(there, trial, at, None if damping else step, least)
             if not more < _CORRECTED * excess:
                 break

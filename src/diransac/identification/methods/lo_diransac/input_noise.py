@@ -109,6 +109,7 @@ class Noisy:
     settings: LoDiransacSettings
     least: FloatArray
     unbroken: FloatArray
+    settled = 0.01
 
     def after(self, step: Step) -> Fit:
         """The fit with every scale updated from residuals and errors of inputs."""

@@ -57,11 +57,15 @@ _TAU_START = 0.3
 _SIGMA_FLOOR = 1e-5
 # Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
 _LEAST_PRIOR = 1e-6
-# Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT = 1e-3
+"""Unmodelled accelerations of a model that is taken to be exact, over their prior size."""
+_OFF = 1e-8
+"""Input gain and bias discrepancies that are off, over that which equals an equation's inertial force."""
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 _MAX_SWEEPS = 12
+HOPELESS = 0.1
+"""Loss of log-likelihood per sample, of errors a tenth larger, from which on a fit is clearly less likely."""
 # Change of an error of a recording over its standard error that ends a fit.
 _ERRORS_SETTLED = 0.1
 
@@ -252,14 +256,24 @@ def diverges(fit: Fit) -> bool:
 
 
 class Schedule(Protocol):
-    """Rule by which the scales of a fit follow its steps."""
+    """Rule by which the scales of a fit follow its steps.
+
+    Parameters
+    ----------
+    settled : float
+        Change of a parameter, standard errors, and relative change of the noise that end a fit.
+    """
+
+    settled: float
 
     def after(self, step: Step) -> Fit:
         """The fit after a step, with every scale updated."""
         ...
 
 
-def minimise(intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: int) -> Refinement:
+def minimise(
+    intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: int, rival: float = np.inf
+) -> Refinement:
     """The fit after Gauss-Newton steps, with an update of every scale after each, until convergence.
 
     Parameters
@@ -271,6 +285,9 @@ def minimise(intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: 
     schedule : Schedule
     limit : int
         Largest number of steps.
+    rival : float, optional
+        Negative log-likelihood of the samples in another fit.  This one ends where the gain of its last step in each
+        that is left would leave its samples clearly less likely.
 
     Returns
     -------
@@ -282,6 +299,7 @@ def minimise(intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: 
         The time limit was reached.
     """
     damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
+    loss, hopeless = np.inf, rival + HOPELESS * np.count_nonzero(intervals.known)
     del fit
     while steps < limit and not converged:
         check_time()
@@ -289,7 +307,11 @@ def minimise(intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: 
         step = gauss_newton_step(at, damping)
         intervals, damping, updated = step.intervals, step.damping, schedule.after(step)
         errors = np.sqrt(np.diag(step.solved.var_p)[: intervals.n_p])
-        converged = step.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors)
+        converged = step.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors, schedule.settled)
+        if hopeless < np.inf:
+            before, loss = loss, updated.noise.loss(updated.residuals, intervals.known)
+            if loss - (limit - steps) * (before - loss) > hopeless:
+                limit = steps
         del at, step  # the next equations take as much memory
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
@@ -301,6 +323,7 @@ class Flexible:
 
     settings: LoDiransacSettings
     prior: Prior
+    settled = 0.01
 
     def after(self, step: Step) -> Fit:
         """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
@@ -331,6 +354,7 @@ class Exact:
     settings: LoDiransacSettings
     tau: FloatArray
     jumps: FloatArray
+    settled = 0.01
 
     @classmethod
     def of(cls, settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Exact:
@@ -351,6 +375,20 @@ class Exact:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class SegmentsApart:
+    """Schedule of simulation error: windows that nothing ties have no scale but the noise."""
+
+    outliers: bool
+    settled = 0.1
+
+    def after(self, step: Step) -> Fit:
+        """The fit with its noise updated."""
+        fit = step.fit
+        noise = fit.noise.updated(fit.residuals, step.intervals.known, outliers=self.outliers)
+        return replace(fit, noise=noise)
+
+
 def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model with discrepancies, whose sizes are those of the largest evidence; errors as `minimise`."""
     return minimise(intervals, fit, Flexible(settings, prior), settings.max_steps)
@@ -359,7 +397,7 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
 def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model as it is, from one with discrepancies, as from `refine`; errors as `minimise`."""
     shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
-    shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _EXACT * prior.guarded * prior.unit[intervals.n_p :]
+    shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _OFF * prior.unit[intervals.n_p :]
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
     return minimise(intervals, fit, Exact.of(settings, intervals, fit, prior), settings.max_steps)
@@ -418,15 +456,16 @@ def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> Fl
     return sizes
 
 
-def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
-    """True if parameters move by less than a hundredth of their standard errors, and scales by a few hundredths."""
+def _unchanged(old: Fit, new: Fit, errors: FloatArray, settled: float) -> bool:
+    """True if no parameter moves by a part of its standard error, nor the noise by as much, and other scales hardly."""
     n_p = len(errors)
     moved = np.abs(new.shared - old.shared)[:n_p] / (errors + 1e-9 * np.abs(old.shared[:n_p]) + 1e-300)
     changes = (
-        (np.abs(np.log(new.noise.sigma / old.noise.sigma)), 0.01),
+        (moved, settled),
+        (np.abs(np.log(new.noise.sigma / old.noise.sigma)), settled),
         (np.abs(np.log(new.tau / old.tau)), 0.05),
         (np.abs(new.rho - old.rho), 0.02),
         (np.abs(np.log(new.continuity_std / old.continuity_std)), 0.05),
         (np.abs(np.log(new.prior[n_p:] / old.prior[n_p:])), 0.1),
     )
-    return bool((moved < 0.01).all() and all((change < limit).all() for change, limit in changes))
+    return all(bool((change < limit).all()) for change, limit in changes)
