@@ -1,6 +1,6 @@
 """Properties of the estimator that any form of it must have: what changes no answer, and which problems are one.
 
-The machine is a damped spring with an offset of its force, driven by steps; its log is made by a plain Runge-Kutta loop.
+The machine is a damped spring that is driven by steps; its log is made by a plain Runge-Kutta loop.
 """
 
 from functools import cache
