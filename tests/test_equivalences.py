@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 
 import diransac as dr
 from diransac.data.dataset import Dataset
+from diransac.identification.core.fit import Fit, with_residuals
+from diransac.identification.core.minimise import SegmentsApart, minimise
+from diransac.identification.core.noise import Mixture
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
-from diransac.identification.methods.lo_diransac.mixture import Mixture
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, with_residuals
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.refinement import SegmentsApart, minimise
 
 TRUTH = {"stiffness": 9.0, "damping": 0.6}
 DT = 0.02

@@ -17,8 +17,8 @@ from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
 from diransac.errors import TimeLimitError
 from diransac.identification.assessment.inspection import inspect
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.regression import observers as search
 from diransac.identification.regression.multistart import least_squares

@@ -12,10 +12,10 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, interpolated, runs,
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
 from diransac.errors import LogError
+from diransac.identification.core.noise import lower_scale
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.estimate import HorizonScores
 from diransac.identification.evaluation.simulation import Simulation
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.segments import OUTLYING
 from diransac.identification.prediction.starts import SmoothedLog, StartEstimator, followed_log, smoothed_log
 from diransac.identification.regression.multistart import least_squares

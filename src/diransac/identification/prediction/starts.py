@@ -24,12 +24,12 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset
 from diransac.data.segment import Segment
 from diransac.errors import LogError
+from diransac.identification.core.noise import lower_scale
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.method import LoDiransac
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.methods.lo_diransac.without_equations import followed
 

@@ -20,7 +20,7 @@ from diransac.identification.tracking.step_tests import ChangeTests, ages_of, ch
 from diransac.identification.tracking.window import AS_LIKELY
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
+    from diransac.identification.core.boundary import BoundaryPrior
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stepped_fits import SteppedFit
     from diransac.identification.tracking.window import Linearization, Window

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
+from diransac.identification.core.fit import innovation_std, innovations
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.tracking.window import Linearization
 
 # Correlations of unmodelled accelerations that are larger than usual, and number of their sizes.

@@ -17,7 +17,7 @@ from diransac.identification.tracking.step_tests import change_tests
 from diransac.identification.tracking.stepped_fits import SteppedFit, SteppedFits
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
+    from diransac.identification.core.boundary import BoundaryPrior
     from diransac.identification.tracking.window import Window
 
 

@@ -13,22 +13,22 @@ from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
 from diransac.errors import DiransacError
+from diransac.identification.core.boundary import BoundaryPrior
+from diransac.identification.core.fit import with_residuals
+from diransac.identification.core.minimise import make_prior, negative_log_evidence, refine, start
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.identify import identify
 from diransac.identification.methods.lo_diransac import LoDiransac
-from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.refinement import make_prior, negative_log_evidence, refine, start
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.tracking.surprise import followed
 from diransac.identification.tracking.window import AS_LIKELY, Window
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.core.fit import Fit
     from diransac.identification.result import Result
     from diransac.identification.tracking.stream import Stream
     from diransac.model import Model

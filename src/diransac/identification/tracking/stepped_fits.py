@@ -15,19 +15,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
-from diransac.identification.methods.lo_diransac.joint_equations import bounded, linearized
-from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
-from diransac.identification.methods.lo_diransac.refinement import diverges, negative_log_evidence
+from diransac.identification.core.boundary import BoundaryPrior
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import with_residuals
+from diransac.identification.core.minimise import diverges, negative_log_evidence
+from diransac.identification.core.noise import NoiseSums
+from diransac.identification.core.theta import bounded
 from diransac.identification.tracking.forces import Forces, likeliest, likeliest_forces, since, with_forces
 from diransac.identification.tracking.step_tests import ages_of
 from diransac.identification.tracking.surprise import followed, free_motion
 from diransac.identification.tracking.window import AS_LIKELY, Linearization
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.tracking.window import Window
 
 # Standard deviation of a time within an interval, over its duration.

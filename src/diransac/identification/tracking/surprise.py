@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
-from diransac.identification.methods.lo_diransac.joint_equations import linearized
-from diransac.identification.methods.lo_diransac.normal_equations import weights_of
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import weights_of
+from diransac.identification.core.minimise import gauss_newton_step
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.arrowhead import Factored
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.tracking.window import Window
 
 # Standard deviation of parameters that are held, over their values.

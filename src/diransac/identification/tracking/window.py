@@ -10,26 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, size_or_one
-from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
-from diransac.identification.methods.lo_diransac.joint_equations import linearized
-from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
-from diransac.identification.methods.lo_diransac.scales import (
-    SHRINK,
-    ProcessSums,
-    negligible_jumps,
-    process_sums,
-    unbroken_jumps,
-)
+from diransac.identification.core.boundary import BoundaryPrior
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import innovation_std, innovations, with_residuals
+from diransac.identification.core.minimise import gauss_newton_step
+from diransac.identification.core.noise import NoiseSums
+from diransac.identification.core.scales import SHRINK, ProcessSums, negligible_jumps, process_sums, unbroken_jumps
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.tracking.forces import gain_of_freedom
 from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.arrowhead import Factored
+    from diransac.identification.core.equations import NormalEquations
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stream import Stream
 

@@ -19,8 +19,12 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import split, with_residuals
+from diransac.identification.core.minimise import refine, refine_exact, refine_further, start
+from diransac.identification.core.theta import ErrorKind
+from diransac.identification.core.windows import SHORTEST_LAG, ShootingIntervals
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.input_noise import (
     averaged_noise,
     explains_all,
@@ -30,26 +34,23 @@ from diransac.identification.methods.lo_diransac.input_noise import (
     simpler_timings,
 )
 from diransac.identification.methods.lo_diransac.integration_steps import answer, with_fewest_steps
-from diransac.identification.methods.lo_diransac.joint_equations import RecordingError, linearized
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
-from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters, projected_parameters
 from diransac.identification.methods.lo_diransac.recording_errors import (
+    RecordingError,
     clear_errors,
     errors_of_inputs,
     errors_of_signals,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, refine_further, start
-from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG, ShootingIntervals
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.minimise import Prior, Refinement
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
@@ -33,7 +34,6 @@ from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -49,10 +49,10 @@ from diransac.process import memory_kept
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.fit import Fit
     from diransac.identification.estimate import LogEstimate
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.settings import Settings
 
 _GAUSSIAN = 10_000

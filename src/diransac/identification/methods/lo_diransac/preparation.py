@@ -10,13 +10,13 @@ import numpy as np
 from diransac.arrays import FloatArray, long_runs
 from diransac.data.segment import silent_rows
 from diransac.errors import LogError
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.methods.lo_diransac.screening import (
     odd_window,
     running_median,
     screened_inputs,
     stuck_rows,
 )
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion, Samples, choose_half_widths, smooth
 from diransac.simulation import default_threads
 

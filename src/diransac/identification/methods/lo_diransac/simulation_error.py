@@ -22,17 +22,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.core.equations import linearize, without_windows
+from diransac.identification.core.fit import Fit, weights_of, with_residuals
+from diransac.identification.core.minimise import HOPELESS, SegmentsApart, minimise
+from diransac.identification.core.noise import Mixture, lower_scale
+from diransac.identification.core.theta import bounded
 from diransac.identification.estimate import LogEstimate
-from diransac.identification.methods.lo_diransac.joint_equations import bounded
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    Fit,
-    linearize,
-    weights_of,
-    with_residuals,
-    without_windows,
-)
-from diransac.identification.methods.lo_diransac.refinement import HOPELESS, SegmentsApart, minimise
 from diransac.identification.methods.lo_diransac.segments import (
     ActingInputs,
     Segments,
@@ -45,7 +40,7 @@ from diransac.identification.methods.lo_diransac.sources import Blocks, Candidat
 
 if TYPE_CHECKING:
     from diransac.arrays import IntArray
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 _SHORTEST, _GROWTH = 8, 3

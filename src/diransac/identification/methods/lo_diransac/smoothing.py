@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, row_blocks
 from diransac.data.checks import rows_per_sample
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.core.noise import lower_scale
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Local optimisation: the most probable motion, parameters and discrepancies, given the logs.
+"""The one loop: Gauss-Newton steps, each followed by an update of every scale by the schedule of the fit.
 
 Gauss-Newton steps on `normal_equations`, each followed by an update of every scale:
 
@@ -20,38 +20,40 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
-from diransac.identification.methods.lo_diransac.joint_equations import linearized
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    Fit,
-    cost,
-    innovation_std,
-    with_residuals,
-)
-from diransac.identification.methods.lo_diransac.scales import (
+from diransac.identification.core.arrowhead import Factored
+from diransac.identification.core.equations import JointEquations, cost, linearized
+from diransac.identification.core.fit import Fit, innovation_std, with_residuals
+from diransac.identification.core.noise import Mixture, lower_scale
+from diransac.identification.core.scales import (
     SHRINK,
     most_probable_size,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
 )
-from diransac.identification.methods.lo_diransac.segments import DIVERGED
+from diransac.identification.core.windows import DIVERGED, ShootingIntervals
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.gauss_newton import Step
-    from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
+_MAX_TRIALS = 8
+_CORRECTED = 0.3
+"""Largest part of the excess of cost that a correction for the curvature of the rollouts may leave."""
+_FIRST_DAMPING = 1e-7
+"""Damping of the first step that needs one."""
+_LEAST_DAMPING = 1e-9
+"""Damping below which there is none."""
+_ROUNDING = 1e-9
+"""Relative change of the cost that is none."""
 # Where tau starts, in spreads of the accelerations.
 _TAU_START = 0.3
 _SIGMA_FLOOR = 1e-5
@@ -68,6 +70,73 @@ HOPELESS = 0.1
 """Loss of log-likelihood per sample, of errors a tenth larger, from which on a fit is clearly less likely."""
 # Change of an error of a recording over its standard error that ends a fit.
 _ERRORS_SETTLED = 0.1
+
+
+@dataclass(frozen=True)
+class Step:
+    """Step of a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        After the step.
+    at : JointEquations
+        Before it.
+    taken : Factored or None
+        None of a damped one.
+    damping : float
+        Of the next step.
+    """
+
+    intervals: ShootingIntervals
+    fit: Fit
+    at: JointEquations
+    taken: Factored | None
+    damping: float
+
+    @cached_property
+    def solved(self) -> Factored:
+        """Solution without damping, which is no information: scales and standard errors follow from it."""
+        return self.taken or self.at.solve()
+
+    @property
+    def of_errors(self) -> float:
+        """Largest change of an error of the recordings over its standard error."""
+        sizes, std, _ = self.at.errors_of(self.solved)
+        return float((np.abs(sizes) / std).max(initial=0.0))
+
+
+def gauss_newton_step(at: JointEquations, damping: float) -> Step:
+    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls.
+
+    Parameters
+    ----------
+    at : JointEquations
+        Result of `linearized`.
+    damping : float
+
+    Returns
+    -------
+    Step
+    """
+    intervals, fit, weights = at.intervals, at.fit, at.of_fit.weights
+    before = cost(intervals, fit, weights)
+    for trials in range(_MAX_TRIALS):
+        right, excess = at.right, np.inf
+        while True:
+            step = at.solve(right, damping)
+            there, trial = at.moved(step)
+            more = cost(there, trial, intervals.weights_in(there, weights)) - before
+            if more <= _ROUNDING * before:
+                least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                return Step(there, trial, at, None if damping else step, least)
+            if not more < _CORRECTED * excess:
+                break
+            right, excess = at.corrected(there, trial), more
+            del step, trial  # the next ones take as much memory
+        damping = max(10.0 * damping, _FIRST_DAMPING)
+    return Step(intervals, fit, at, None, damping)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
