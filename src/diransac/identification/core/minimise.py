@@ -1,8 +1,8 @@
 """The one loop: Gauss-Newton steps, each followed by an update of every scale by the schedule of the fit.
 
-Gauss-Newton steps on `normal_equations`, each followed by an update of every scale:
+The scales of `Flexible`:
 
-- the noise of each signal, by EM (`mixture`);
+- the noise of each signal, by EM (`noise`);
 - tau, the size of the unmodelled accelerations, by the evidence: with tau large, intervals stand alone; with tau = 0,
   a log is one rollout.  Models of real machines are accurate to a thousandth of the accelerations at best; this prior
   has the weight of one interval, so that tau does not vanish where noise hides the discrepancies;
@@ -54,22 +54,26 @@ _LEAST_DAMPING = 1e-9
 """Damping below which there is none."""
 _ROUNDING = 1e-9
 """Relative change of the cost that is none."""
-# Where tau starts, in spreads of the accelerations.
 _TAU_START = 0.3
-_SIGMA_FLOOR = 1e-5
-# Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
+"""Size of unmodelled accelerations at the start of a fit, in spreads of the accelerations."""
+_GUARDED = 0.1
+"""Size of discrepancies at the start of a fit, over that of their prior."""
+SIGMA_FLOOR = 1e-5
+"""Least noise of a signal, over its spread."""
 _LEAST_PRIOR = 1e-6
+"""Least prior size of unmodelled accelerations, in their spreads: none would make the equations singular."""
 _EXACT = 1e-3
 """Unmodelled accelerations of a model that is taken to be exact, over their prior size."""
 _OFF = 1e-8
 """Input gain and bias discrepancies that are off, over that which equals an equation's inertial force."""
-# Where they start, and the factor by which they are lowered in a step.
-_NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
-_MAX_SWEEPS = 12
+_NEARLY_EXACT = 10.0
+"""Unmodelled accelerations at the start of an exact fit, over their prior size."""
+_TIGHTENED = 0.1
+"""Factor by which a step lowers the scales of an exact fit."""
+_LOOSE = 10.0
+"""Change of an error of a recording that ends a fit, over that of a parameter."""
 HOPELESS = 0.1
 """Loss of log-likelihood per sample, of errors a tenth larger, from which on a fit is clearly less likely."""
-# Change of an error of a recording over its standard error that ends a fit.
-_ERRORS_SETTLED = 0.1
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,7 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
         tau=max(settings.prior_model_error, _LEAST_PRIOR) * _accelerations(intervals.model, motion),
         unit=unit,
         discrepancy=settings.prior_discrepancy,
-        guarded=settings.initial_discrepancy,
+        guarded=_GUARDED * settings.prior_discrepancy,
     )
 
 
@@ -243,7 +247,7 @@ def start(
     x, d = motion.signals[intervals.starts, :n_x].copy(), np.zeros((len(intervals), n_v))
     shared = np.concatenate([p, np.zeros(intervals.n_shared - len(p))])
     residuals, ends = intervals.simulated(shared, x, d)
-    floor = _SIGMA_FLOOR * motion.spread
+    floor = SIGMA_FLOOR * motion.spread
     sigma = 1.5 * np.maximum(np.nan_to_num(lower_scale(residuals, intervals.known), nan=1.0), floor)
     low = np.where(intervals.known, intervals.measured, np.inf).min(axis=0)
     high = np.where(intervals.known, intervals.measured, -np.inf).max(axis=0)
@@ -267,7 +271,7 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
     n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
     # States that changed since those of their neighbours were last propagated from them: others give what they gave.
     forward, backward = np.ones(n, bool), np.ones(n, bool)
-    for _ in range(_MAX_SWEEPS):
+    for _ in range(n):
         after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
         fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
         backward |= forward
@@ -376,7 +380,7 @@ def minimise(
         step = gauss_newton_step(at, damping)
         intervals, damping, updated = step.intervals, step.damping, schedule.after(step)
         errors = np.sqrt(np.diag(step.solved.var_p)[: intervals.n_p])
-        converged = step.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors, schedule.settled)
+        converged = step.of_errors < _LOOSE * schedule.settled and _unchanged(at.fit, updated, errors, schedule.settled)
         if hopeless < np.inf:
             before, loss = loss, updated.noise.loss(updated.residuals, intervals.known)
             if loss - (limit - steps) * (before - loss) > hopeless:

@@ -59,8 +59,10 @@ LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 AS_LIKELY = 5.0
 """Difference of two fits' evidence, nats, below which both are as likely."""
 
-# Shortest interval, samples.
 _SHORTEST = 3
+"""Shortest interval, samples."""
+_MOST_ERRORS = 8
+"""Errors of recordings that the settings do not name, at most."""
 # Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 # Delays, samples, of held inputs that vary between samples.
@@ -217,7 +219,7 @@ class LocalSearch:
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""
-        for k in range(self.settings.max_recording_errors):
+        for k in range(_MOST_ERRORS):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:

@@ -95,9 +95,6 @@ class LoDiransac(LoDiransacSettings):
         Signals, or inputs, whose delay is estimated in any case, signals whose bias is, and inputs whose gain drifts;
         that of no other is.  An input's delay is its own, besides that of all.  None: those that the residuals show
         clearly.
-    max_recording_errors : int, optional
-        Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
-        is exact, only those of inputs, of groups of sensors, and of sensors with a measurement equation.
     substeps : int, optional
         Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
         One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
@@ -109,9 +106,8 @@ class LoDiransac(LoDiransacSettings):
         Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
     prior_model_error : float, optional
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
-    prior_discrepancy, initial_discrepancy : float, optional
-        Size of input gain and bias discrepancies, over that which equals an equation's inertial force: of the prior,
-        and before the evidence determines it.
+    prior_discrepancy : float, optional
+        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force.
     projection : bool, optional
         Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
         those of the fit.
