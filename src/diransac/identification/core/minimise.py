@@ -214,7 +214,7 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
         tau=max(settings.prior_model_error, _LEAST_PRIOR) * _accelerations(intervals.model, motion),
         unit=unit,
         discrepancy=settings.prior_discrepancy,
-        guarded=_GUARDED * settings.prior_discrepancy,
+        guarded=max(_GUARDED * settings.prior_discrepancy, _OFF),
     )
 
 
