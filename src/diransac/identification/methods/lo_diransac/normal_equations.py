@@ -267,14 +267,10 @@ def linearize(
     g[1:, :n_x] -= precision * jumps
     E = np.zeros((len(H) - 1, k, k))
     np.multiply(-precision[:, :, None], F[:, :, :k], out=E[:, :n_x])
-    follows, own = intervals.following[:, None], 1.0 / innovation_std(intervals, fit)
-    rho = np.where(follows[1:], fit.rho, 0.0)
-    deviation = own * innovations(intervals, fit)
-    own_diagonal[:, n_x:k] += np.square(own)
-    own_diagonal[:-1, n_x:k] += np.square(rho * own[1:])
-    np.einsum("wii->wi", E)[:, n_x:] -= rho * np.square(own[1:])
-    g[:, n_x:k] -= deviation
-    g[:-1, n_x:k] += rho * deviation[1:]
+    diagonal, below, pull = innovation_terms(intervals, fit)
+    own_diagonal[:, n_x:k] += diagonal
+    np.einsum("wii->wi", E)[:, n_x:] += below
+    g[:, n_x:k] += pull
     beforehand = 1.0 / np.square(fit.prior)
     corners, rights = H[:, k:, k:], g[:, k:]
     border, corner, right = _shared_blocks(intervals, H[:, :k, k:], corners, rights)
@@ -433,6 +429,26 @@ def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     found = fit.d.copy()
     found[1:] -= np.where(intervals.linked[:, None], fit.rho, 0.0) * found[:-1]
     return np.asarray(found / innovation_std(intervals, fit))
+
+
+def innovation_terms(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Terms of the innovations in the normal equations: diagonals of D and E, and right-hand side.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (W, n_v) array, (W - 1, n_v) array, (W, n_v) array
+    """
+    std, rho = innovation_std(intervals, fit), np.where(intervals.following[1:, None], fit.rho, 0.0)
+    own, deviation = np.square(1.0 / std), innovations(intervals, fit) / std
+    diagonal, right, below = own.copy(), -deviation, -rho * own[1:]
+    diagonal[:-1] += np.square(rho) * own[1:]
+    right[:-1] += rho * deviation[1:]
+    return diagonal, below, right
 
 
 def _shared_blocks(
