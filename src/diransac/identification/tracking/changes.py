@@ -16,7 +16,7 @@ from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.tracking.estimates import Change
 from diransac.identification.tracking.fits import Forces, with_forces
 from diransac.identification.tracking.steps import (
-    Found,
+    Explanation,
     SteppedFit,
     StepTests,
     ages_of,
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 _WORK = 150_000
 """Samples times unknowns of the fits of a search in an update: three windows of a quadrotor at 250 Hz."""
-_CLEAR = 3.0
-"""Evidence, nats, from which on a parameter drifts."""
 
 
 class Drift:
@@ -103,7 +101,8 @@ class Drift:
         # A single window, however much it differs, is no drift.
         self._likelihood[known] += weight * np.minimum(gain - gain[:, :1], 2.0)[known]
         best = np.argmax(self._likelihood, axis=1)[:, None]
-        clear = np.take_along_axis(self._likelihood, best, 1)[:, 0] - self._likelihood[:, 0] - _CLEAR
+        # A parameter drifts from an evidence of 3 nats on.
+        clear = np.take_along_axis(self._likelihood, best, 1)[:, 0] - self._likelihood[:, 0] - 3.0
         probability = clear > 0.0 if exact else 1.0 / (1.0 + np.exp(-clear))
         estimated = np.take_along_axis(rates, best, 1)[:, 0] * probability
         self.rate = np.where(np.isnan(self._given), estimated, np.square(self._given))
@@ -136,7 +135,7 @@ class Changes:
         self._pending: list[Change] = []
         # What was known where the window begins with a change, as long as that may turn out to be none.
         self._kept: BoundaryPrior | None = None
-        self._searched: tuple[Window, Generator[None, None, tuple[int, Found | None]]] | None = None
+        self._searched: tuple[Window, Generator[None, None, tuple[int, Explanation | None]]] | None = None
         self._is_sure = False
         self._reported: list[Change] = []
         self._new: list[Change] = []
@@ -145,14 +144,14 @@ class Changes:
         """Let the parameters drift for a step, before the window."""
         window.diffuse(np.sqrt(self.drift.rate * self.step))
 
-    def after_step(self, window: Window, at: JointEquations) -> None:
+    def after_step(self, window: Window, equations: JointEquations) -> None:
         """Test for changes, release a parameter that has changed, and report what is determined."""
         usual, n, is_full = self._usual_forces(window), len(window), len(window) == window.most
         # Where a change has begun the window, those that came with it are tested.
-        tests = step_tests(with_forces(at, usual), ages_of(n) if is_full else np.array([n]))
+        tests = step_tests(with_forces(equations, usual), ages_of(n) if is_full else np.array([n]))
         gain = tests.gain(window.fit.shared, self._scatter(tests.ages, n)).max()
         if is_full:
-            known, T = tests.own[-1].copy(), self._duration(window)
+            known, T = tests.precision[-1].copy(), self._duration(window)
             known[self._changing] = 0.0
             self.drift.learn(window.fit.shared, tests.sizes[-1], known, T, self.step / T, exact=window.is_exact)
             self._learned += np.inf if window.is_exact or window.setup.exact else self.step
@@ -214,9 +213,9 @@ class Changes:
 
     def _learn_scatter(self, tests: StepTests) -> None:
         """Remember the scatter of the tests of a full window."""
-        n, ages, own = int(tests.ages[-1]), tests.ages[:, None], tests.own
+        n, ages, precision = int(tests.ages[-1]), tests.ages[:, None], tests.precision
         most = 2.0 * self._price(tests.ages) * self._scatter(tests.ages, n)
-        seen = np.minimum(np.square(tests.sizes) * own, most), own > 0.0
+        seen = np.minimum(np.square(tests.sizes) * precision, most), precision > 0.0
         places, faded = self._places(tests.ages, n), np.exp(-self.step / MEMORY)
         for sums, new in zip((self._squares, self._counts), seen, strict=True):
             sums[places] = faded * sums[places] + new / ages
@@ -236,33 +235,33 @@ class Changes:
                 next(search)
             except StopIteration as end:
                 self._searched = None
-                age, found = end.value
+                age, explanation = end.value
                 # What has not been clear is asked again with a quarter more intervals.
                 self._rest = age // 4
-                if found is not None:
-                    self._decide(window, then, found)
+                if explanation is not None:
+                    self._decide(window, then, explanation)
                 return
 
-    def _decide(self, window: Window, then: Window, found: Found) -> None:
+    def _decide(self, window: Window, then: Window, explanation: Explanation) -> None:
         """Release the parameters that have changed, unless forces or a drift explain as much.
 
         Parameters
         ----------
         window, then : Window
             Now, and when the search began.
-        found : Found
+        explanation : Explanation
         """
-        step, price = found.step, self._price(ages_of(len(then)))
+        step, price = explanation.step, self._price(ages_of(len(then)))
         clear = AS_LIKELY * len(step.changed)
-        if found.over_rivals > clear and found.over_usual > found.scatter * price:
+        if explanation.over_rivals > clear and explanation.over_usual > explanation.scatter * price:
             is_bound = self._layout.on_bounds(step.fit.shared)[step.changed].any()
             if step.first >= window.first_of(then) and not is_bound:
-                self._release(window, then, step, found.known)
-        elif self._kept is not None and found.over_rivals < 0.0:
-            window.begin_with(then, 0, found.without)
+                self._release(window, then, step, explanation.known)
+        elif self._kept is not None and explanation.over_rivals < 0.0:
+            window.begin_with(then, 0, explanation.without)
             self._pending, self._kept = [], None
-        elif found.over_rivals < -AS_LIKELY and self._firing * self.step > self._duration(window):
-            self._usual = np.stack([np.log(found.larger.tau[-1]), found.larger.rho])
+        elif explanation.over_rivals < -AS_LIKELY and self._firing * self.step > self._duration(window):
+            self._usual = np.stack([np.log(explanation.larger.tau[-1]), explanation.larger.rho])
 
     def _release(self, window: Window, then: Window, step: SteppedFit, known: FloatArray) -> None:
         """Begin the window with a step, whose values are reported once it is found again, and they are known.

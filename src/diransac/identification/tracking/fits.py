@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
-_HELD = 1e-6
-"""Standard deviation of parameters that are held, over their values."""
 _GUST = 0.9
 """Correlation from interval to interval of unmodelled accelerations that are larger than usual."""
 
@@ -104,7 +102,7 @@ def followed(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, float]:
 
 def free_motion(intervals: ShootingIntervals, fit: Fit, largest: FloatArray) -> Fit:
     """Fit that follows the samples, whatever the parameters, with unmodelled accelerations ``(n_v,)`` of some size."""
-    held = _HELD * np.maximum(np.abs(fit.shared), _HELD)
+    held = 1e-6 * (np.abs(fit.shared) + 1e-6)
     free = replace(fit, tau=largest, rho=np.zeros_like(fit.rho), prior=held, prior_mean=fit.shared, boundary=None)
     return followed(intervals, free)[0]
 
@@ -130,47 +128,47 @@ def left_by(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None =
     """
     weights = weights_of(intervals, fit) if weights is None else weights.copy()
     weights[-intervals.length :] = 0.0
-    at = linearize(intervals, fit, weights)
+    equations = linearize(intervals, fit, weights)
     point = np.concatenate([fit.x[-1], fit.d[-1], fit.shared])
-    return BoundaryPrior.of_information(point, *at.system.eliminated(at.right_z, at.right_s))
+    return BoundaryPrior.of_information(point, *equations.system.eliminated(equations.right_z, equations.right_s))
 
 
 # ---------------------------------------------------------------------- other forces at a linearised window
 
 
-def with_forces(at: JointEquations, forces: Forces) -> JointEquations:
+def with_forces(equations: JointEquations, forces: Forces) -> JointEquations:
     """Equations of a window with other scales of the unmodelled accelerations."""
-    fit, n_x = forces.acting(at.fit), at.fit.x.shape[1]
-    old, new = (innovation_terms(at.intervals, x) for x in (at.fit, fit))
-    own, below, right = (b - a for a, b in zip(old, new, strict=True))
-    system = replace(at.system, diagonal=at.system.diagonal.copy(), below=at.system.below.copy())
-    np.einsum("wii->wi", system.diagonal)[:, n_x:] += own
+    fit, n_x = forces.acting(equations.fit), equations.fit.x.shape[1]
+    old, new = (innovation_terms(equations.intervals, x) for x in (equations.fit, fit))
+    diagonal, below, right = (b - a for a, b in zip(old, new, strict=True))
+    system = replace(equations.system, diagonal=equations.system.diagonal.copy(), below=equations.system.below.copy())
+    np.einsum("wii->wi", system.diagonal)[:, n_x:] += diagonal
     np.einsum("wii->wi", system.below)[:, n_x:] += below
-    right_z = at.of_fit.right_z.copy()
+    right_z = equations.of_fit.right_z.copy()
     right_z[:, n_x:] += right
-    of_fit = replace(at.of_fit, system=system, right_z=right_z)
-    return replace(at, fit=fit, of_fit=of_fit, system=system, right=(right_z, at.of_fit.right_s))
+    of_fit = replace(equations.of_fit, system=system, right_z=right_z)
+    return replace(equations, fit=fit, of_fit=of_fit, system=system, right=(right_z, equations.of_fit.right_s))
 
 
-def likeliest(at: JointEquations, trials: Sequence[Forces]) -> tuple[Forces, float]:
+def likeliest(equations: JointEquations, trials: Sequence[Forces]) -> tuple[Forces, float]:
     """Those of some unmodelled accelerations with the largest evidence at a linearised window, and that."""
-    return max(((x, _evidence(with_forces(at, x))) for x in trials), key=lambda x: x[1])
+    return max(((x, _evidence(with_forces(equations, x))) for x in trials), key=lambda x: x[1])
 
 
-def _evidence(at: JointEquations) -> float:
+def _evidence(equations: JointEquations) -> float:
     """Logarithm of the evidence of a linearised window, up to terms that do not depend on unmodelled accelerations."""
-    solved, std = at.solve(), innovation_std(at.intervals, at.fit)
-    gained = (at.right[0] * solved.step_z).sum() + at.right[1] @ solved.step_p
-    cost = np.square(innovations(at.intervals, at.fit)).sum()
+    solved, std = equations.solve(), innovation_std(equations.intervals, equations.fit)
+    gained = (equations.right[0] * solved.step_z).sum() + equations.right[1] @ solved.step_p
+    cost = np.square(innovations(equations.intervals, equations.fit)).sum()
     return float(0.5 * (gained - cost - solved.log_det) - np.log(std[np.isfinite(std)]).sum())
 
 
-def gain_of_freedom(at: JointEquations, least: FloatArray, expected: FloatArray, most: FloatArray) -> float:
+def gain_of_freedom(equations: JointEquations, least: FloatArray, expected: FloatArray, most: FloatArray) -> float:
     """Evidence, nats, that unmodelled accelerations gain over a model that is exact.
 
     Parameters
     ----------
-    at : JointEquations
+    equations : JointEquations
     least, expected : (n_v,) array
         Sizes of the unmodelled accelerations of an exact model, and those that are expected of any other.
     most : (n_v,) array
@@ -183,24 +181,24 @@ def gain_of_freedom(at: JointEquations, least: FloatArray, expected: FloatArray,
     """
     none = np.zeros_like(least)
     others = [Forces(expected, none), Forces(np.minimum(30.0 * expected, most), none + _GUST)]
-    if (at.fit.tau > least).any():
-        others = [Forces(at.fit.tau, at.fit.rho)]
-    return likeliest(at, others)[1] - likeliest(at, [Forces(least, none)])[1]
+    if (equations.fit.tau > least).any():
+        others = [Forces(equations.fit.tau, equations.fit.rho)]
+    return likeliest(equations, others)[1] - likeliest(equations, [Forces(least, none)])[1]
 
 
-def likeliest_forces(at: JointEquations, least: FloatArray, most: FloatArray, ages: Iterable[int]) -> Forces:
+def likeliest_forces(equations: JointEquations, least: FloatArray, most: FloatArray, ages: Iterable[int]) -> Forces:
     """Unmodelled accelerations that explain a linearised window best: its own, or larger ones from a time on.
 
     Parameters
     ----------
-    at : JointEquations
+    equations : JointEquations
     least, most : (n_v,) array
         Sizes between which they are sought, where its own are not larger.
     ages : iterable of int
         Intervals at the end of the window in which they may be larger.
     """
-    usual = Forces(np.broadcast_to(at.fit.tau, at.fit.d.shape), at.fit.rho)
+    usual = Forces(np.broadcast_to(equations.fit.tau, equations.fit.d.shape), equations.fit.rho)
     low, rho = np.maximum(usual.tau, least), np.maximum(usual.rho, _GUST)
     shares = np.linspace(0.0, 1.0, 5)
-    larger = likeliest(at, [Forces(low * (np.maximum(most, low) / low) ** x, rho) for x in shares])[0]
-    return likeliest(at, [usual, *(usual.until(age, larger) for age in ages)])[0]
+    larger = likeliest(equations, [Forces(low * (np.maximum(most, low) / low) ** x, rho) for x in shares])[0]
+    return likeliest(equations, [usual, *(usual.until(age, larger) for age in ages)])[0]

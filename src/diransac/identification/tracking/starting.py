@@ -203,10 +203,10 @@ def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
     shared = window.fit.shared if window.is_exact else given.parameters
     alone = replace(window.fit, boundary=window.beginning)
     fits = [(_settled(window.setup, window, alone)[1] + AS_LIKELY, window.setup, window.fit)]
-    for own in (replace(window.setup, hold=hold) for hold in given.holds):
+    for other in (replace(window.setup, hold=hold) for hold in given.holds):
         fit = replace(alone, shared=shared, tau=window.least, rho=np.zeros_like(window.least))
-        fit, evidence = _settled(own, window, fit)
-        fits.append((evidence, own, fit))
+        fit, evidence = _settled(other, window, fit)
+        fits.append((evidence, other, fit))
     _, best, fit = max(fits, key=lambda x: x[0])
     return _with_fewest_steps(setup, best, window.stream, window.first, fit)
 
@@ -219,10 +219,10 @@ def _settled(setup: Setup, window: Window, fit: Fit) -> tuple[Fit, float]:
     return fit, -np.inf
 
 
-def _with_fewest_steps(setup: Setup, own: Setup, stream: Stream, first: int, fit: Fit) -> tuple[Setup, Fit]:
+def _with_fewest_steps(setup: Setup, other: Setup, stream: Stream, first: int, fit: Fit) -> tuple[Setup, Fit]:
     """A problem with the fewest integration steps of one with the most that change no parameter of a fit noticeably."""
-    few, fit = with_fewest_steps(own.intervals(stream, first, len(fit.x)), fit, setup.settings.substeps)
-    return replace(own, settings=replace(setup.settings, substeps=few.substeps)), fit
+    few, fit = with_fewest_steps(other.intervals(stream, first, len(fit.x)), fit, setup.settings.substeps)
+    return replace(other, settings=replace(setup.settings, substeps=few.substeps)), fit
 
 
 def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, motion: Motion) -> tuple[Setup, Fit, float]:
@@ -231,10 +231,12 @@ def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, moti
     if covariance is None:
         units = size_or_one(parameter_units(intervals, motion, p))
         covariance = np.diag(np.square(np.maximum(np.abs(p), units)))
+    rough = zip(p.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+    priors = dict(zip(setup.layout.names, rough, strict=True))
+    intervals = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
     prior = make_prior(setup.settings, intervals, motion, np.full(len(p), np.inf))
-    fit = _with_boundary(start(setup.settings, intervals, motion, p, prior), p, covariance)
-    found = refine(setup.settings, intervals, fit, prior)
-    return setup, _with_boundary(found.fit, p, covariance), found.cost
+    refinement = refine(setup.settings, intervals, start(setup.settings, intervals, motion, p, prior), prior)
+    return setup, _with_boundary(refinement.fit, p, covariance), refinement.cost
 
 
 def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:
@@ -246,7 +248,8 @@ def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:
     places = n + np.flatnonzero(known)
     information[np.ix_(places, places)] = np.linalg.inv(covariance[np.ix_(known, known)])
     point = np.concatenate([fit.x[0], np.zeros_like(fit.d[0]), p])
-    return replace(fit, boundary=BoundaryPrior.of_information(point, information, np.zeros(len(point))))
+    boundary, none = BoundaryPrior.of_information(point, information, np.zeros(len(point))), np.zeros_like(fit.prior)
+    return replace(fit, boundary=boundary, prior=none + np.inf, prior_mean=none)
 
 
 # ---------------------------------------------------------------------- a start by the default method

@@ -68,14 +68,14 @@ class StepTests:
     information: FloatArray
 
     @property
-    def own(self) -> FloatArray:
+    def precision(self) -> FloatArray:
         """Inverse variances ``(A, n)`` of steps one by one."""
         return np.asarray(np.einsum("ajj->aj", self.information))
 
     @property
     def sizes(self) -> FloatArray:
         """Estimated steps ``(A, n)`` one by one."""
-        return np.divide(self.score, self.own, out=np.zeros_like(self.score), where=self.own > 0.0)
+        return np.divide(self.score, self.precision, out=np.zeros_like(self.score), where=self.precision > 0.0)
 
     def gain(self, values: FloatArray, scatter: FloatArray | float = 1.0) -> FloatArray:
         """Logarithms of the Bayes factors of steps as large as the parameters, as eq. (8) of `docs/method.md`.
@@ -91,7 +91,7 @@ class StepTests:
         -------
         (A, n) array
         """
-        return _gain(self.score / scatter, self.own / scatter, np.square(values))
+        return _gain(self.score / scatter, self.precision / scatter, np.square(values))
 
     def likeliest(self, values: FloatArray, scatter: FloatArray) -> tuple[int, IntArray, FloatArray]:
         """Place of the age of the likeliest steps at once, their parameters ``(m,)`` and sizes ``(m,)``.
@@ -106,12 +106,12 @@ class StepTests:
 
     def _together(self, place: int, prior: FloatArray, scatter: FloatArray) -> tuple[float, list[int]]:
         """Evidence, nats, and parameters of a step: one after the other is added as long as it grows."""
-        M, score, own = self.information[place].copy(), self.score[place].copy(), self.own[place]
+        M, score, precision = self.information[place].copy(), self.score[place].copy(), self.precision[place]
         total, chosen = 0.0, list[int]()
-        while len(chosen) < len(own):
+        while len(chosen) < len(precision):
             # Those before must leave some of the information of another parameter, which must add clear evidence.
             left = np.diag(M).clip(0.0)
-            more = np.where(left > 1e-3 * own, _gain(score, left, prior) / scatter, -np.inf)
+            more = np.where(left > 1e-3 * precision, _gain(score, left, prior) / scatter, -np.inf)
             j = int(np.argmax(more))
             if more[j] <= 2.0 * AS_LIKELY * bool(chosen) or j in chosen:
                 break
@@ -138,22 +138,22 @@ def fine_ages_of(n: int) -> IntArray:
     return np.unique(np.minimum(np.round([*powers, n]), n)).astype(np.int64)
 
 
-def step_tests(joint: JointEquations, ages: IntArray) -> StepTests:
+def step_tests(equations: JointEquations, ages: IntArray) -> StepTests:
     """Tests of steps of every parameter at some ages ``(A,)``, in intervals.
 
     Parameters
     ----------
-    joint : JointEquations
+    equations : JointEquations
     ages : (A,) int array
     """
-    at, fit = joint.of_fit, joint.fit
+    at, fit = equations.of_fit, equations.fit
     (W, n_x), k, n = fit.x.shape, at.right_z.shape[1], len(fit.shared)
     since = (np.arange(W) >= W - ages[:, None]).astype(float)
-    own, onward = at.system.border.copy(), -at.precision[:, :, None] * at.slopes[:, :, k:]
-    own[1:, :n_x] -= onward
+    border, onward = at.system.border.copy(), -at.precision[:, :, None] * at.slopes[:, :, k:]
+    border[1:, :n_x] -= onward
     if fit.boundary is not None:
-        own[0] -= fit.boundary.information[:k, k:]
-    of_z = np.einsum("aw,wkj->wkaj", since, own)
+        border[0] -= fit.boundary.information[:k, k:]
+    of_z = np.einsum("aw,wkj->wkaj", since, border)
     of_z[1:, :n_x] += np.einsum("aw,wkj->wkaj", since[:, :-1], onward)
     direct = np.einsum("aw,wij->aij", since, at.corners)
     of_s = direct.swapaxes(0, 1)
@@ -258,7 +258,7 @@ def _before(window: Window, start: Fit, first: int) -> tuple[BoundaryPrior, floa
 
 
 @dataclass(frozen=True)
-class Found:
+class Explanation:
     """Likeliest step of a window, and its rivals.
 
     Parameters
@@ -287,7 +287,7 @@ class Found:
 
 def sought(
     window: Window, usual: Forces, kept: BoundaryPrior | None, ages: IntArray, scatter: FloatArray
-) -> Generator[None, None, tuple[int, Found | None]]:
+) -> Generator[None, None, tuple[int, Explanation | None]]:
     """Search of a window.
 
     Parameters
@@ -322,8 +322,7 @@ def sought(
     best = followed(intervals, larger.acting(start))[0]
     yield
     start = replace(best, shared=fit.shared)
-    at = linearized(intervals, start)
-    tests = step_tests(with_forces(at, usual), ages)
+    tests = step_tests(with_forces(linearized(intervals, start), usual), ages)
     place, chosen, sizes = tests.likeliest(fit.shared, scatter)
     age = int(ages[place])
     if not len(chosen):
@@ -346,6 +345,6 @@ def sought(
             if other.evidence <= step.evidence:
                 break
             step = other
-    known_of, of_step = tests.own[place, chosen], float(scatter[place, chosen].max())
+    known_of, of_step = tests.precision[place, chosen], float(scatter[place, chosen].max())
     over = step.evidence - others[0][1], step.evidence - without
-    return age, Found(step, known_of, of_step, larger, others[1][0], *over)
+    return age, Explanation(step, known_of, of_step, larger, others[1][0], *over)

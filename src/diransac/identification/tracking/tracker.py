@@ -126,11 +126,10 @@ class Tracker:
         LogError
             The time is missing or not finite, columns differ in length, or hold no numbers.
         """
-        found = list(self._estimates(*self._columns(samples)))
-        if not found:
+        new = list(self._estimates(*self._columns(samples)))
+        if not new:
             return None
-        changes = tuple(x for one in found for x in one.changes)
-        return replace(found[-1], changes=changes, notes=tuple(x for one in found for x in one.notes))
+        return replace(new[-1], changes=sum((x.changes for x in new), ()), notes=sum((x.notes for x in new), ()))
 
     @property
     def missing(self) -> str:
@@ -183,10 +182,10 @@ class Tracker:
         """Begin a window where a start is known, and rows enough are there."""
         stream = self._stream
         if self._start is None:
-            found = self._cold.sought(stream, end)
-            if found is None:
+            cold = self._cold.sought(stream, end)
+            if cold is None:
                 return
-            self._setup, self._start, note = found
+            self._setup, self._start, note = cold
             self._notes.append(note)
         first = max(stream.first, stream.fresh)
         n = min((end - first) // stream.length, self._steps)
@@ -231,15 +230,15 @@ class Tracker:
         self._changes.before_step(window)
         try:
             window.extend(n, states)
-            found = window.optimise()
+            equations = window.optimise()
             self._n_updates += 1
             # While the window fills, and whenever all intervals are others, unless forces are remembered.
             is_due = not self._n_updates % self._steps and window.memory.freedom < AS_LIKELY
             is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
             if is_due and self._start is not None and not self._changes.is_suspected:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)
-                found = window.optimise()
-            self._changes.after_step(window, found)
+                equations = window.optimise()
+            self._changes.after_step(window, equations)
         except np.linalg.LinAlgError:
             self._begin_anew()
         else:
