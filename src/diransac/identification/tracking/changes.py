@@ -196,7 +196,7 @@ class Changes:
     def _price(self, ages: IntArray) -> float:
         """Evidence, nats, that a change must gain: the logarithm of the number of tests between two false alarms.
 
-        Of one age, as many tests are independent as fit into an hour without overlapping.
+        Of one age, and steps of one sign, as many are independent as fit into an hour without overlapping.
         """
         per_hour = 3600.0 / self.step * (1.0 / ages).sum() * 2 * len(self.names)
         return float(np.log(per_hour / self.false_alarms))
