@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.window import Window
 
+_CLEAR = 3.0
+"""Evidence, nats, from which on a parameter drifts, or contradicts what was known of it."""
 _WORK = 150_000
 """Samples times unknowns of the fits of a search in an update: three windows of a quadrotor at 250 Hz."""
 
@@ -101,8 +103,7 @@ class Drift:
         # A single window, however much it differs, is no drift.
         self._likelihood[known] += weight * np.minimum(gain - gain[:, :1], 2.0)[known]
         best = np.argmax(self._likelihood, axis=1)[:, None]
-        # A parameter drifts from an evidence of 3 nats on.
-        clear = np.take_along_axis(self._likelihood, best, 1)[:, 0] - self._likelihood[:, 0] - 3.0
+        clear = np.take_along_axis(self._likelihood, best, 1)[:, 0] - self._likelihood[:, 0] - _CLEAR
         probability = clear > 0.0 if exact else 1.0 / (1.0 + np.exp(-clear))
         estimated = np.take_along_axis(rates, best, 1)[:, 0] * probability
         self.rate = np.where(np.isnan(self._given), estimated, np.square(self._given))
@@ -129,6 +130,7 @@ class Changes:
         self._squares, self._counts = np.zeros((2, 32, len(self.names)))
         self._learned, self._rest, self._firing = 0.0, 0, 0
         self._usual: FloatArray | None = None
+        self._doubt = np.zeros(len(self.names))
         self._values, self._since = np.full(len(self.names), np.inf), np.zeros(len(self.names))
         self._anchor, self._is_said = np.zeros((2, len(self.names))), np.zeros(len(self.names), bool)
         # Changes that are not yet determined well enough to be reported.
@@ -150,6 +152,9 @@ class Changes:
         # Where a change has begun the window, those that came with it are tested.
         tests = step_tests(with_forces(equations, usual), ages_of(n) if is_full else np.array([n]))
         gain = tests.gain(window.fit.shared, self._scatter(tests.ages, n)).max()
+        # Forces may explain what contradicts a parameter from before the window: it may be either value.
+        contradicted = tests.gain(window.fit.shared)[-1] > _CLEAR
+        self._doubt = np.where(contradicted, np.square(tests.sizes[-1]), 0.0)
         if is_full:
             known, T = tests.precision[-1].copy(), self._duration(window)
             known[self._changing] = 0.0
@@ -291,7 +296,7 @@ class Changes:
     def _report(self, window: Window) -> None:
         """Report the changes that are determined, and forget those that have turned out to be none."""
         now = float(window.times[-1]) + window.length * window.stream.dt
-        values, errors = window.fit.shared, np.sqrt(np.diag(self.covariance(window)))
+        values, errors = window.fit.shared, np.sqrt(np.diag(self._covariance(window)))
         at_bound, settled = self._layout.on_bounds(values), np.abs(values - self._values) < errors
         for k, change in zip(self._changing, list(self._pending), strict=True):
             clear = self._is_clear(window, values[k] - change.before, np.hypot(errors[k], change.before_error))
@@ -327,6 +332,10 @@ class Changes:
         self._new.append(change)
 
     def covariance(self, window: Window) -> FloatArray:
+        """Covariance of the parameters at the end of the window, with changes that forces may hide."""
+        return self._covariance(window) + np.diag(self._doubt)
+
+    def _covariance(self, window: Window) -> FloatArray:
         """Covariance with the drift during the window, larger where windows scatter more than their covariances."""
         assert window.last is not None
         drift, n = np.diag(self.drift.rate * self._duration(window) / 3.0), len(window)

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 Samples = Log | Mapping[str, npt.ArrayLike]
 
-# Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother.
 _FIRST = 1.0
+"""Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother."""
 
 
 class Tracker:
