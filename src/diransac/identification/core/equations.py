@@ -28,7 +28,13 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.core.arrowhead import Arrowhead, Factored
 from diransac.identification.core.columns import Columns, changes_by, recorrected
-from diransac.identification.core.fit import Fit, innovation_std, innovations, weights_of, with_residuals
+from diransac.identification.core.fit import (
+    Fit,
+    innovation_terms,
+    innovations,
+    weights_of,
+    with_residuals,
+)
 from diransac.identification.core.theta import (
     ErrorKind,
     bounded,
@@ -184,14 +190,10 @@ def linearize(
     g[1:, :n_x] -= precision * jumps
     E = np.zeros((len(H) - 1, k, k))
     np.multiply(-precision[:, :, None], F[:, :, :k], out=E[:, :n_x])
-    follows, own = intervals.following[:, None], 1.0 / innovation_std(intervals, fit)
-    rho = np.where(follows[1:], fit.rho, 0.0)
-    deviation = own * innovations(intervals, fit)
-    own_diagonal[:, n_x:k] += np.square(own)
-    own_diagonal[:-1, n_x:k] += np.square(rho * own[1:])
-    np.einsum("wii->wi", E)[:, n_x:] -= rho * np.square(own[1:])
-    g[:, n_x:k] -= deviation
-    g[:-1, n_x:k] += rho * deviation[1:]
+    diagonal, below, pull = innovation_terms(intervals, fit)
+    own_diagonal[:, n_x:k] += diagonal
+    np.einsum("wii->wi", E)[:, n_x:] += below
+    g[:, n_x:k] += pull
     beforehand = 1.0 / np.square(fit.prior)
     corners, rights = H[:, k:, k:], g[:, k:]
     border, corner, right = shared_blocks(intervals, H[:, :k, k:], corners, rights)

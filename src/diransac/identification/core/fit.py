@@ -173,3 +173,23 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     found = fit.noise.inlying(fit.residuals, intervals.known)
     found /= np.square(fit.noise.sigma)
     return found
+
+
+def innovation_terms(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Terms of the innovations in the normal equations: diagonals of D and E, and right-hand side.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+
+    Returns
+    -------
+    (W, n_v) array, (W - 1, n_v) array, (W, n_v) array
+    """
+    std, rho = innovation_std(intervals, fit), np.where(intervals.following[1:, None], fit.rho, 0.0)
+    own, deviation = np.square(1.0 / std), innovations(intervals, fit) / std
+    diagonal, right, below = own.copy(), -deviation, -rho * own[1:]
+    diagonal[:-1] += np.square(rho) * own[1:]
+    right[:-1] += rho * deviation[1:]
+    return diagonal, below, right
