@@ -165,7 +165,7 @@ class Simulation:
         compared = np.ones(len(dataset.signals), bool) if signals is None else signals
         resolution = resolution or Resolution()
         names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
-        self._segments, self._layout = dataset.segments, dataset.layout
+        self.segments, self._layout = dataset.segments, dataset.layout
         self._stretches = [stretches_of(one, "first") for one in dataset.segments] if stretches is None else stretches
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
@@ -185,7 +185,7 @@ class Simulation:
         LogError
             A log lacks a state on which a measured signal depends.
         """
-        pairs = zip(self._segments, self._stretches, strict=True)
+        pairs = zip(self.segments, self._stretches, strict=True)
         return [[(x.rows, one.part(x.rows).initial_state(x.rule)) for x in stretches] for one, stretches in pairs]
 
     def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
@@ -205,7 +205,7 @@ class Simulation:
         Scores
         """
         logs = []
-        for i, (one, runs_of_log) in enumerate(zip(self._segments, self._runs, strict=True)):
+        for i, (one, runs_of_log) in enumerate(zip(self.segments, self._runs, strict=True)):
             own, found = self._layout.of_log(parameters, i), []
             for run in runs_of_log:
                 lanes = RolloutBatch(own, run.state, run.inputs, one.log.dt)
@@ -263,7 +263,7 @@ class Simulation:
     def _restarted(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
     ) -> tuple[RolloutBatch, Measurements]:
-        one, measured = self._segments[log], np.nan_to_num(self._measured[log].values)
+        one, measured = self.segments[log], np.nan_to_num(self._measured[log].values)
         more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
         inputs, measured = (np.pad(x, more, mode="edge") for x in (self._inputs[log], measured))
         lanes = np.tile(parameters, (len(states), 1))

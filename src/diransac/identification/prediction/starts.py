@@ -50,8 +50,6 @@ class SmoothedLog:
         over few samples follows their noise: then about the line between neighbours, which adds its curvature.
     outliers : (N, n_s) bool array
         Samples of the dataset's signals that are far from the motion.
-    samples : (n_s,) array
-        Mean number of each signal's samples over which the motion is smoothed.
     intervals : ShootingIntervals or None
         The log in shooting intervals, of a model with equations.
     """
@@ -59,7 +57,6 @@ class SmoothedLog:
     signals: FloatArray
     noise: FloatArray
     outliers: BoolArray
-    samples: FloatArray
     intervals: ShootingIntervals | None = None
 
 
@@ -89,7 +86,7 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     least = 1e-3 * motion.spread[columns]
     # Outliers are six standard deviations of the noise from the motion.
     outliers = known & (np.abs(np.where(known, distances, 0.0)) > 6.0 * np.maximum(noise, least))
-    return SmoothedLog(signals, noise, outliers, samples, intervals)
+    return SmoothedLog(signals, noise, outliers, intervals)
 
 
 def followed_log(dataset: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
@@ -111,9 +108,7 @@ def followed_log(dataset: Dataset, parameters: FloatArray, resolution: Resolutio
     columns = [model.signals.index(n) for n in one.signals]
     signals = found.signals[: len(one)].copy()
     signals[one.gaps] = np.nan
-    samples = np.isfinite(one.measured).mean(axis=0) * found.length
-    outliers = found.outliers[: len(one), columns]
-    return SmoothedLog(signals, found.noise[columns], outliers, samples)
+    return SmoothedLog(signals, found.noise[columns], found.outliers[: len(one), columns])
 
 
 def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:
@@ -228,37 +223,52 @@ class StartEstimator:
         (K, n_x, n_x) array
             Independent errors of each state, of one standard deviation, a row each.
         """
-        segments, begin = self._segments(rows), self._begin(rows)
-        K, n_x = begin.shape
-        lanes = np.tile(self.parameters, (K, 1))
-        found = segments.gauss_newton(lanes, begin, self._weights(segments, self.noise), np.arange(K))
-        information = found.normal_matrix * np.outer(self._spread, self._spread) + np.eye(n_x)
+        segments, lanes = self._segments(rows - self.n_before), np.tile(self.parameters, (len(rows), 1))
+        found = segments.gauss_newton(
+            lanes, self._fitted(segments), self._weights(segments, self.noise), np.arange(len(rows))
+        )
+        information = found.normal_matrix * np.outer(self._spread, self._spread) + np.eye(len(self._spread))
         values, vectors = np.linalg.eigh(information)
         roots = (vectors / np.sqrt(np.maximum(values, 1.0))[:, None, :]).swapaxes(1, 2) * self._spread
         finite: BoolArray = np.asarray(np.isfinite(found.final_states).all(axis=1))
         states = np.where(finite[:, None], found.final_states, self.states[rows])
         return states, roots @ np.nan_to_num(found.final_slopes).swapaxes(1, 2)
 
+    def drawn(self, rows: IntArray, firsts: IntArray) -> FloatArray:
+        """States ``(K, n_x)`` at any rows, of simulations that follow the rows before, or the first ones of a stretch.
+
+        Parameters
+        ----------
+        rows : (K,) int array
+        firsts : (K,) int array
+            First row of the stretch of each, which has ``n_before`` rows at least.
+        """
+        begins = np.maximum(rows - self.n_before, firsts)
+        segments, lanes = self._segments(begins), np.tile(self.parameters, (1, len(rows), 1))
+        longer = replace(segments, n_rows=self.n_before + 1)
+        series = longer.trajectories(lanes, self._fitted(segments)[None])[0]
+        states = series[np.arange(len(rows)), rows - begins, : self.states.shape[1]]
+        return np.where(np.isfinite(states).all(axis=1, keepdims=True), states, self.states[rows])
+
     def errors(self, rows: IntArray, *, fitted: bool) -> FloatArray:
         """Simulated less measured signals ``(K, n_before, n_signals)`` before some rows; NaN where unknown.
 
         Simulations are fitted to the samples, or start from the states without the model.
         """
-        segments = self._segments(rows)
+        segments = self._segments(rows - self.n_before)
         found = np.full((len(rows), segments.n_rows, len(self.noise)), np.nan)
-        begin = self._begin(rows) if fitted else self.states[segments.starts]
-        errors = segments.errors(np.tile(self.parameters, (1, len(rows), 1)), begin[None])[0]
+        states = self._fitted(segments) if fitted else self.states[segments.starts]
+        errors = segments.errors(np.tile(self.parameters, (1, len(rows), 1)), states[None])[0]
         found[:, :, segments.columns] = np.where(segments.known, errors, np.nan)
         return found
 
-    def _segments(self, rows: IntArray) -> Segments:
-        """Segments that end before some rows."""
-        return Segments(self.intervals, self.acting, rows - self.n_before, self.n_before)
+    def _segments(self, begins: IntArray) -> Segments:
+        """Segments of ``n_before`` rows."""
+        return Segments(self.intervals, self.acting, begins, self.n_before)
 
-    def _begin(self, rows: IntArray) -> FloatArray:
-        """States ``(K, n_x)`` at the first row of each segment."""
-        segments = self._segments(rows)
-        first, lanes = self.states[segments.starts][None], np.tile(self.parameters, (1, len(rows), 1))
+    def _fitted(self, segments: Segments) -> FloatArray:
+        """States ``(K, n_x)`` at the first row of each segment by the samples in it."""
+        first, lanes = self.states[segments.starts][None], np.tile(self.parameters, (1, len(segments), 1))
         weights = self._weights(segments, self.scale)
         found: FloatArray = segments.estimated_states(lanes, first, self._spread, weights)[0]
         return found
