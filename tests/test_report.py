@@ -195,7 +195,7 @@ def predicted(result, log):
     """A changed result with the predictions of its log made again."""
     recorded = log if result.diagnosis is None else log.measured
     dataset = Dataset.of(result.model, recorded, judged_signals(result.model, [recorded], result.settings), given=[log])
-    (summary,) = predictions(result.estimate, result.evaluation, dataset, result.settings)
+    (summary,) = predictions(result.estimate, result.evaluation, dataset)
     logs = (dataclasses.replace(result.logs[0], prediction=summary),)
     return dataclasses.replace(changed(result, logs=logs), predictions=dr.validate(result, log).predictions)
 

@@ -13,14 +13,11 @@ from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.estimate import Estimate, Evaluation, Prediction
 from diransac.identification.evaluation.scoring import as_estimated
 from diransac.identification.evaluation.simulation import Simulation
-from diransac.identification.settings import Settings
 
 
-def predictions(
-    estimate: Estimate, evaluation: Evaluation, dataset: Dataset, settings: Settings
-) -> list[Prediction | None]:
+def predictions(estimate: Estimate, evaluation: Evaluation, dataset: Dataset) -> list[Prediction | None]:
     """Agreement of each log with its simulation; None for a log without its initial state."""
-    acting, _ = as_estimated(dataset, estimate.diagnosis, settings)
+    acting = as_estimated(dataset, estimate.diagnosis)
     simulation = Simulation(acting, resolution=estimate.resolution)
     ends = np.cumsum([0, *map(len, dataset.given)])
     summaries: list[Prediction | None] = []
