@@ -23,8 +23,6 @@ from diransac.model import Model
 
 StartRule = Literal["smoothed", "measured"]
 
-_ROUNDS = 3
-"""Scales depend on starts, and these on scales: after three rounds they hardly change."""
 _MOST_ROWS = 200_000
 """Rows of a stretch that windows of a horizon predict, about; of longer ones every other window is enough."""
 
@@ -116,7 +114,11 @@ class OpenLoop:
         self.segment: Segment = alone.segments[0]
         self.simulation = Simulation(alone, resolution=resolution)
         self.parameters = dataset.model.parameter_vector(parameters)
-        self.smoothed = _smoothed(alone, self.parameters, resolution) if start == "smoothed" else None
+        self.smoothed: SmoothedLog | None = None
+        if start == "smoothed" and alone.model.has_equations:
+            self.smoothed = smoothed_log(alone)
+        elif start == "smoothed":
+            self.smoothed = followed_log(alone, self.parameters, resolution)
         if self.smoothed is not None and noise:
             most = np.array([noise.get(name, np.inf) for name in self.segment.signals])
             self.smoothed = replace(self.smoothed, noise=np.fmin(self.smoothed.noise, most))
@@ -147,20 +149,21 @@ class OpenLoop:
         noise, those from many what the model lacks: those are used from which the rows after them are predicted best.
         """
         assert self.smoothed is not None
-        n, columns = estimator.n_before, [self.segment.model.signals.index(x) for x in self.segment.signals]
+        n = estimator.n_before
         ends = np.concatenate([np.append(np.arange(x.start, x.stop, n), x.stop) for x in self.stretches])
         smooth = self._of_whole_quaternions(self.outliers)
-        for k in range(_ROUNDS):
+        # Scales depend on starts, and these on scales: after three rounds they hardly change.
+        for k in range(3):
             errors, scale, noise = self._short_errors(estimator, ends, fitted=k > 0)
             near = np.zeros(smooth.shape, bool)
             np.logical_or.at(near, ends[:, None] + np.arange(-n, 0), np.abs(errors) <= OUTLYING * scale)
             self.outliers = smooth & ~near
             self.noise = np.fmin(self.smoothed.noise, noise)
-            estimator = estimator.refined(columns, self.noise, scale, self.outliers)
+            estimator = estimator.refined(self.noise, scale, self.outliers)
         rows, tried = ends[ends + n < len(self.segment)], estimator.shorter()
         for x in tried[1:]:  # of which the model lacks less
             self.noise = np.fmin(self.noise, self._short_errors(x, ends, fitted=True)[2])
-        tried = [x.refined(columns, self.noise, scale, self.outliers) for x in tried]
+        tried = [x.refined(self.noise, scale, self.outliers) for x in tried]
         return min(tried, key=lambda x: self._misses(x, rows, n)) if len(rows) and len(tried) > 1 else tried[0]
 
     def _of_whole_quaternions(self, outliers: BoolArray) -> BoolArray:
@@ -175,8 +178,7 @@ class OpenLoop:
         self, estimator: StartEstimator, ends: IntArray, *, fitted: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Errors ``(K, n, n_s)`` of simulations before some rows, their scale without outliers, and the noise in it."""
-        columns, n = [self.segment.model.signals.index(x) for x in self.segment.signals], estimator.n_before
-        errors = estimator.errors(ends, fitted=fitted)[:, :, columns]
+        n, errors = estimator.n_before, estimator.errors(ends, fitted=fitted)
         outliers = self.outliers[ends[:, None] + np.arange(-n, 0)]
         known, scale = _known_scale(np.where(outliers, np.nan, errors))
         # A short simulation fits two numbers to the samples of a signal.
@@ -375,11 +377,6 @@ def _coordinate_rates(model: Model, states: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------- states of a log
 
 
-def _smoothed(alone: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
-    """One log, smoothed without the model, or followed by one without equations; None where it is too short."""
-    return smoothed_log(alone) if alone.model.has_equations else followed_log(alone, parameters, resolution)
-
-
 def _states(
     segment: Segment, layout: ParameterLayout, parameters: FloatArray, smoothed: SmoothedLog | None
 ) -> FloatArray:
@@ -394,16 +391,15 @@ def _states(
     if smoothed is not None and not model.has_equations:
         return smoothed.signals[:, : len(model.state)]
     derived = () if smoothed is None else derived_velocities(segment, matter)
-    lacking = [n for n in model.state if n in matter and n not in (*segment.present, *derived)]
-    hidden = tuple(n for n in lacking if smoothed is not None or n in model.first_order)
+    seen = [n for n in matter if n in (*segment.present, *derived)]
+    hidden = tuple(n for n in matter if n not in seen and (smoothed is not None or n in model.first_order))
     given = dict.fromkeys((*hidden, *derived), 0.0)
     states = np.tile(segment.initial_state(given or "first"), (len(segment), 1))
-    for i, name in enumerate(model.state):
-        if smoothed is not None and name in matter and (name in segment.present or name in derived):
-            states[:, i] = smoothed.signals[:, model.signals.index(name)]
-            states[segment.gaps, i] = np.nan
-        elif name in segment.present and name in matter:
-            states[:, i] = segment.column(name)
+    if smoothed is None:
+        signals = segment.with_signals(model.signals).measured
+    else:
+        signals = np.where(segment.gaps[:, None], np.nan, smoothed.signals)
+    states[:, [model.state.index(n) for n in seen]] = signals[:, [model.signals.index(n) for n in seen]]
     if hidden:
         states[:, [model.state.index(n) for n in hidden]] = _unmeasured(segment, layout, parameters, states, hidden)
     return states
@@ -424,9 +420,7 @@ def _unmeasured(
     """States ``(N, n)`` that the log lacks, whose initial values agree best with the other velocities and sensors."""
     model, known = segment.model, interpolated(states)
     observed = [i for i, n in enumerate(model.state) if n in model.velocities and n not in hidden]
-    absent = np.full(len(segment), np.nan)
-    sensors = [segment.column(n) if n in segment.present else absent for n in model.sensors]
-    compared = np.column_stack([states[:, observed], *sensors])
+    compared = np.column_stack([states[:, observed], segment.with_signals(tuple(model.sensors)).measured])
     seen = np.isfinite(compared)
     spread = np.array([x[ok].std() if ok.any() else 0.0 for x, ok in zip(compared.T, seen.T, strict=True)])
     weights = np.where(seen, 1.0 / np.square(size_or_one(spread)), 0.0)

@@ -13,7 +13,6 @@ Gasser, Sroka, Jennen-Steinmetz 1986 (noise by pseudo-residuals); Ljung 1999, "S
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,9 +31,6 @@ from diransac.identification.methods.lo_diransac.segments import ActingInputs, S
 from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.methods.lo_diransac.without_equations import followed
-
-_FINEST = 1e-6
-"""Noise over the range of a signal, at least: the weights of samples without noise."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,13 +135,15 @@ class StartEstimator:
     parameters : (n_p,) array
     states : (N, n_x) array
         States at every row, without the model: means of a prior, whose standard deviations are their spread.
-    noise : (n_signals,) array
-        Standard deviation of each signal of the model, its unit; infinite for one that the log lacks.
-    finest : (n_signals,) array
+    columns : (n_s,) int array
+        Places of the segment's signals among the model's.
+    finest : (n_s,) array
         Least standard deviation of each signal: that of one without noise.
-    scale : (n_signals,) array
+    noise : (n_s,) array
+        Standard deviation of each signal, its unit.
+    scale : (n_s,) array
         By which samples are weighted: of what the model leaves of each signal.
-    outliers : (N, n_signals) bool array
+    outliers : (N, n_s) bool array
         Samples that do not count.
     n_before : int
         Rows before a state whose samples determine it.
@@ -155,8 +153,9 @@ class StartEstimator:
     acting: ActingInputs
     parameters: FloatArray
     states: FloatArray
-    noise: FloatArray
+    columns: IntArray
     finest: FloatArray
+    noise: FloatArray
     scale: FloatArray
     outliers: BoolArray
     n_before: int
@@ -182,15 +181,14 @@ class StartEstimator:
         intervals = replace(smoothed.intervals, substeps=resolution.substeps)
         acting = resolution.timing.acting(segment.inputs, segment.log.dt, resolution.hold)
         values = np.pad(acting, ((0, len(intervals.measured) - len(acting)), (0, 0)), mode="edge")
-        columns = [intervals.model.signals.index(n) for n in segment.signals]
-        noise, outliers = np.full((2, len(intervals.model.signals)), np.inf), np.zeros(intervals.sampled.shape, bool)
-        noise[1, columns] = _FINEST * _width_of_bulk(segment.measured)
-        noise[0, columns] = np.maximum(smoothed.noise, noise[1, columns])
-        outliers[: len(segment), columns] = smoothed.outliers
+        columns = np.array([intervals.model.signals.index(n) for n in segment.signals])
+        # Samples without noise have the weight of noise of a millionth of their range.
+        finest = 1e-6 * _width_of_bulk(segment.measured)
+        noise = np.maximum(smoothed.noise, finest)
         longest = max((x.stop - x.start for x in runs(~segment.gaps)), default=0)
         n_before = max(1, min(intervals.length, longest // 2))
         inputs = ActingInputs(values, resolution.hold, resolution.timing)
-        return cls(intervals, inputs, parameters, states, noise[0], noise[1], noise[0], outliers, n_before)
+        return cls(intervals, inputs, parameters, states, columns, finest, noise, noise, smoothed.outliers, n_before)
 
     def shorter(self) -> list[StartEstimator]:
         """The same, and those that use a half and a quarter of the rows, of five samples at least."""
@@ -198,15 +196,11 @@ class StartEstimator:
         rows = {n for n in (self.n_before, self.n_before // 2, self.n_before // 4) if n >= min(fewest, self.n_before)}
         return [replace(self, n_before=n) for n in sorted(rows, reverse=True)]
 
-    def refined(
-        self, columns: Sequence[int], noise: FloatArray, scale: FloatArray, outliers: BoolArray
-    ) -> StartEstimator:
-        """The same with other noise and scales ``(n,)``, and outliers ``(N, n)``, of some signals."""
-        some, every, found = self.noise.copy(), self.scale.copy(), self.outliers.copy()
-        some[columns] = np.maximum(noise, self.finest[columns])
-        every[columns] = np.where(np.isfinite(scale), np.maximum(scale, some[columns]), every[columns])
-        found[: len(outliers), columns] = outliers
-        return replace(self, noise=some, scale=every, outliers=found)
+    def refined(self, noise: FloatArray, scale: FloatArray, outliers: BoolArray) -> StartEstimator:
+        """The same with other noise, scales, where they are finite, and outliers."""
+        noise = np.maximum(noise, self.finest)
+        scale = np.where(np.isfinite(scale), np.maximum(scale, noise), self.scale)
+        return replace(self, noise=noise, scale=scale, outliers=outliers)
 
     def at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """States at some rows, and how uncertain they are.
@@ -251,16 +245,16 @@ class StartEstimator:
         return np.where(np.isfinite(states).all(axis=1, keepdims=True), states, self.states[rows])
 
     def errors(self, rows: IntArray, *, fitted: bool) -> FloatArray:
-        """Simulated less measured signals ``(K, n_before, n_signals)`` before some rows; NaN where unknown.
+        """Simulated less measured signals ``(K, n_before, n_s)`` before some rows; NaN where unknown.
 
         Simulations are fitted to the samples, or start from the states without the model.
         """
         segments = self._segments(rows - self.n_before)
-        found = np.full((len(rows), segments.n_rows, len(self.noise)), np.nan)
+        found = np.full((len(rows), segments.n_rows, len(self.intervals.model.signals)), np.nan)
         states = self._fitted(segments) if fitted else self.states[segments.starts]
         errors = segments.errors(np.tile(self.parameters, (1, len(rows), 1)), states[None])[0]
         found[:, :, segments.columns] = np.where(segments.known, errors, np.nan)
-        return found
+        return found[:, :, self.columns]
 
     def _segments(self, begins: IntArray) -> Segments:
         """Segments of ``n_before`` rows."""
@@ -274,10 +268,10 @@ class StartEstimator:
         return found
 
     def _weights(self, segments: Segments, scale: FloatArray) -> FloatArray:
-        """Weights ``(N, n_s)`` of the compared signals in all rows."""
-        counted = self.intervals.sampled & ~self.outliers
-        found: FloatArray = counted[:, segments.columns] / np.square(scale[segments.columns])
-        return found
+        """Weights of the compared signals in all rows, of scales ``(n_s,)``."""
+        weights = np.zeros(self.intervals.sampled.shape)
+        weights[: len(self.outliers), self.columns] = ~self.outliers / np.square(scale)
+        return np.where(self.intervals.sampled, weights, 0.0)[:, segments.columns]
 
     @cached_property
     def _spread(self) -> FloatArray:
