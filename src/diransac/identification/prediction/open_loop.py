@@ -152,7 +152,8 @@ class OpenLoop:
         n = estimator.n_before
         ends = np.concatenate([np.append(np.arange(x.start, x.stop, n), x.stop) for x in self.stretches])
         smooth = self._of_whole_quaternions(self.outliers)
-        # Scales depend on starts, and these on scales: after three rounds they hardly change.
+        # Scales depend on starts, and these on scales: after three rounds they hardly change.  The first are those of
+        # simulations from the smoothed motion, so that a signal of which the model is wrong does not pull the starts.
         for k in range(3):
             errors, scale, noise = self._short_errors(estimator, ends, fitted=k > 0)
             near = np.zeros(smooth.shape, bool)
