@@ -51,13 +51,17 @@ def _weakest_window(segment: Segment, inliers: BoolArray) -> tuple[float, float,
 def _modelled_accelerations(
     simulation: Simulation, log: int, parameters: FloatArray, diagnosis: Diagnosis
 ) -> dict[str, FloatArray]:
-    """Accelerations of a log by the model, simulated over each window of a diagnosis from its smoothed state."""
+    """Accelerations of a log by the model, simulated from about twelve of the smoothed states of a diagnosis."""
     segment, model = simulation.segments[log], simulation.segments[log].model
-    rows = np.round((diagnosis.smoothed_time - segment.log.time[segment.offset]) / segment.log.dt).astype(int)
-    states = np.column_stack([diagnosis.smoothed_states[n] for n in model.state])
-    width = int(np.median(np.diff(rows))) if len(rows) > 1 else len(segment)
-    series = simulation.trajectories(log, parameters, states, rows, width)
-    return {n: series[:, :, model.signals.index(n)] for n in model.accelerations}
+    every = max(1, round(len(diagnosis.smoothed_time) / 12))
+    time = diagnosis.smoothed_time[::every]
+    rows = np.round((time - segment.log.time[segment.offset]) / segment.log.dt).astype(int)
+    states = np.column_stack([diagnosis.smoothed_states[n][::every] for n in model.state])
+    n_rows = int(np.median(np.diff(rows))) if len(rows) > 1 else len(segment)
+    series = simulation.trajectories(log, parameters, states, rows, n_rows)
+    simulated = rows[:, None] + np.arange(n_rows)
+    logged = (simulated < len(segment)) & ~segment.gaps[np.minimum(simulated, len(segment) - 1)]
+    return {n: series[logged][:, model.signals.index(n)] for n in model.accelerations}
 
 
 def unexplained(
