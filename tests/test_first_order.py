@@ -311,6 +311,23 @@ def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names
     assert_right(identified(make, simulate, names, 0.005, 0.1), truth, largest)
 
 
+@pytest.mark.parametrize(
+    ("make", "simulate", "name", "hidden"),
+    [(lagged_thrust, thrust_signals, "z", "thrust"), (flexible_joint, joint_signals, "motor", "load")],
+    ids=["thrust behind a lag", "load behind a spring"],
+)
+def test_a_state_that_nothing_measures_is_simulated_and_drawn(make, simulate, name, hidden, tmp_path):
+    result, log = identified(make, simulate, (name,)), recorded(simulate(), [name])
+    t, signals, _ = simulate()
+    simulated = dr.simulate(result, log)
+    expected = np.interp(simulated.time, t, signals[hidden])
+    assert np.abs(simulated[hidden] - expected).max() < 0.05 * np.ptp(expected)
+    dr.write_report(result, log, tmp_path / "page.html")
+    assert f'aria-label="{hidden} in {result.model.units[hidden]}, simulated over' in (
+        tmp_path / "page.html"
+    ).read_text(encoding="utf-8")
+
+
 def test_a_resonance_that_smoothing_takes_for_noise_is_found():
     """A search that begins with the smoothed motion ends at rotors that are three times as heavy."""
     found = dr.identify(flexible_joint(), recorded(stiff_joint_signals(), ["motor"], 0.01), differentiate=True)
