@@ -424,20 +424,15 @@ class ShootingIntervals:
         Returns
         -------
         (n * length, n_s) array
-            Simulated less measured signals, huge from a divergence on; 0 of signals that nothing measures.
+            Simulated less measured signals, huge from a divergence on.
         (n, n_x) array
             States one row after the last of each interval, NaN where it diverges.
         """
-        (derived, columns), rows = self._derived, self._rows_about(chosen)
-        errors, ends = derived.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements(rows, columns))
+        rows = self._rows_about(chosen)
+        errors, ends = self.rollouts.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements(rows))
         if not np.isfinite(errors).all():
             np.nan_to_num(errors, copy=False, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
-        errors = errors.reshape(-1, errors.shape[2])
-        if isinstance(columns, slice):
-            return errors, ends
-        residuals = np.zeros((len(errors), self.measured.shape[1]))
-        residuals[:, columns] = errors
-        return residuals, ends
+        return errors.reshape(-1, errors.shape[2]), ends
 
     def gauss_newton(
         self,
