@@ -403,11 +403,10 @@ def _mistakes(dataset: Dataset, *, delays: bool = True) -> tuple[list[Mistake], 
     """Mistakes of columns that explain the logs, and the number of those tested; none without equations."""
     if not dataset.model.has_equations:
         return [], 0
-    from diransac.identification.regression.nonlinear import solved_nonlinear
 
     def found() -> tuple[list[Mistake], int]:
         with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-            return mistakes_of_columns(dataset, solved_nonlinear, delays=delays)
+            return mistakes_of_columns(dataset, delays=delays)
 
     try:
         return dataset.kept(("mistakes of columns", delays), found)

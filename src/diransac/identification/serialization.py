@@ -87,12 +87,8 @@ def _decode_mask(data: Any) -> BoolArray:
     return np.unpackbits(packed, count=n_rows).astype(bool)
 
 
-def _decode_pair(data: Any) -> tuple[float, float]:
-    first, second = data
-    return _decode_number(first), _decode_number(second)
-
-
-_NUMBER, _NUMBERS = Form(_encode_number, _decode_number), Form(_encode_numbers, _decode_numbers)
+_NUMBER = Form(_encode_number, _decode_number)
+_NUMBERS = Form(_encode_numbers, _decode_numbers)
 _MASK = Form(_encode_mask, _decode_mask)
 
 Number = Annotated[float, _NUMBER]
@@ -105,9 +101,7 @@ Mask = Annotated[BoolArray, _MASK]
 """An array ``(N,)`` of Booleans, packed."""
 Values = Annotated[Mapping[str, float], _NUMBER.by_name()]
 """Numbers by name."""
-NumberPairs = Annotated[
-    Mapping[str, tuple[float, float]], Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair).by_name()
-]
+NumberPairs = Mapping[str, tuple[Number, Number]]
 """Pairs of numbers by name."""
 Series = Annotated[Mapping[str, FloatArray], _NUMBERS.by_name()]
 """Arrays by name."""

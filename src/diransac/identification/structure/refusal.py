@@ -195,6 +195,6 @@ def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:
     found = solved(model, layout, rows)
     if found is None or not signed or not signed <= set(layout.violations(found.parameters)):
         return
-    mistakes, _ = explanations(CorrectionTests(model, layout, rows, solved), dataset.given)
+    mistakes, _ = explanations(CorrectionTests(model, layout, rows), dataset.given)
     if mistakes and "reversed" in mistakes[0].what:
         raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")
