@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,13 +25,10 @@ from diransac.data.units import conversion, one_turn
 from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.regression.rows import MotionRows, motion_rows
 from diransac.identification.structure.column_corrections import (
-    DISTINCT,
     EXPLAINED,
-    MUCH_BETTER,
     SAME_FACTOR,
     CorrectedEquations,
     CorrectionTests,
-    conversions,
     corrections,
     explained,
     other_units,
@@ -193,23 +190,21 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     if wrapped:
         return wrapped
     prepared = [continuous(in_units(_middle(log).measured, model), model) for log in logs]
-    if model.kinematics is not None and not model.quaternions:
-        return _of_kinematics(model, prepared)
     ratios = list(_ratios(model, prepared))
     clocks = {unit: conversion(unit, "s") or 1.0 for unit in ("ms", "us")}
     slow = [u for u, x in clocks.items() if ratios and all(_is_near(r.ratio, x**r.order) for r in ratios)]
     if slow and len(ratios) > 1:
         why = f"all derivatives are those of a clock that is {number(1.0 / clocks[slow[0]])} times as fast"
         return [Mistake(f"The time is in {slow[0]}, not in s", why, _scaled(["t"], clocks[slow[0]]))]
-    named = dict[tuple[str, float], list[tuple[_Ratio, str]]]()
+    named = dict[tuple[str, float], list[tuple[_Ratio, tuple[str, ...]]]]()
     for ratio in ratios:
-        for name, unit, factor in _culprits(model, ratio)[:1]:
-            named.setdefault((unit, factor), []).append((ratio, name))
+        for names, unit, factor in _culprits(model, ratio)[:1]:
+            named.setdefault((unit, factor), []).append((ratio, names))
     found = list[Mistake]()
     for (unit, factor), same in named.items():
-        names, first = list(dict.fromkeys(name for _, name in same)), same[0][0]
-        derivative = "second derivative" if first.order == 2 else "derivative"
-        why = f"the {derivative} of {first.low} is {number(first.ratio, 3)} times {first.high}"
+        names, first = list(dict.fromkeys(n for _, names in same for n in names)), same[0][0]
+        what = f"the {'second derivative' if first.order == 2 else 'derivative'} of {first.low}"
+        why = f"{what} is {number(first.ratio, 3)} times {first.should_be}"
         why += f" (or the time is in {slow[0]}: --scale t={clocks[slow[0]]:g})" if slow else ""
         found.append(Mistake(_in_unit(names, unit, model.units[names[0]]), why, _scaled(names, factor)))
     return found
@@ -243,56 +238,41 @@ def wraps(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     return list(found.values())
 
 
-def _of_kinematics(model: Model, logs: Sequence[Log]) -> list[Mistake]:
-    """Coordinates or velocities in other units, with which the kinematics ``dq/dt = k(q, v)`` hold much better."""
-    rates = model.velocities_of_motion
-    names = (*model.coordinates, *rates)
-    if not all(n in log for log in logs for n in names):
-        return []
-    columns = [(np.stack([np.nan_to_num(log[n]) for n in names]), log.dt) for log in logs]
-
-    def mismatch(group: Sequence[str], factor: float) -> float:
-        """Changes of coordinates less the integrals of their rates, over the changes, by medians."""
-        assert model.kinematics is not None
-        factors, found = np.where([n in group for n in names], factor, 1.0)[:, None], []
-        parts = [(np.split(x * factors, [model.n_q]), dt) for x, dt in columns]
-        whole = [(q, np.vstack([v, np.zeros((model.n_v - len(v), q.shape[1]))]), dt) for (q, v), dt in parts]
-        for span in _SPANS[:4]:
-            pairs = [_changes(q, np.array(model.kinematics(q, v)), dt, 1, span) for q, v, dt in whole]
-            y, x = np.concatenate(pairs, axis=2)
-            sizes = np.median(np.abs(y), axis=1) + np.finfo(float).tiny
-            found.append(float((np.median(np.abs(y - x), axis=1) / sizes).mean()))
-        return min((x for x in found if np.isfinite(x)), default=np.inf)
-
-    hypotheses = chain(conversions(model.coordinates), conversions(rates))
-    tested = [(mismatch(x.names, x.factor), x) for x in hypotheses if not x.offset]
-    tested.sort(key=lambda x: (x[0], len(x[1].names)))
-    (best, one), as_recorded = tested[0], mismatch((), 1.0)
-    if best > min(EXPLAINED, MUCH_BETTER * as_recorded) or tested[1][0] < DISTINCT * best:
-        return []
-    ratio = number(as_recorded / best, 2)
-    why = f"with this corrected, the kinematics of the model hold {ratio} times as well"
-    return [Mistake(_in_unit(one.names, one.unit, model.units[one.names[0]]), why, _scaled(one.names, one.factor))]
-
-
 @dataclass(frozen=True)
 class _Ratio:
-    """Ratio of a derivative of a column, of order 1 or 2, and the column that should be it."""
+    """Ratio of a derivative of a column, of order 1 or 2, and what it should be: a column, or kinematics of several."""
 
     low: str
-    high: str
+    high: tuple[str, ...]
     order: int
     ratio: float
+    should_be: str
 
 
 def _ratios(model: Model, logs: Sequence[Log]) -> Iterator[_Ratio]:
     """Ratios of all columns whose derivative is measured, too, where derivative and column agree but for a factor."""
-    for names in model.chains:
+    chains, motion = model.chains, (*model.coordinates, *model.velocities_of_motion)
+    if model.kinematics is not None and not model.quaternions and all(n in log for log in logs for n in motion):
+        chains, by_log = chains[model.n_q :], [_coordinate_rates(model, log) for log in logs]
+        equations, arguments = model.kinematics.jac_sparsity(0, 1).get_triplet()
+        for i, low in enumerate(model.coordinates):
+            high = tuple(list(model.velocities)[k] for row, k in zip(equations, arguments, strict=True) if row == i)
+            columns = [(log[low], rates[i], log.dt) for log, rates in zip(logs, by_log, strict=True)]
+            yield from (_Ratio(low, high, 1, x, "that of the kinematics") for x in _ratio(columns, 1) if high)
+    for names in chains:
         for low, high in pairwise(n for n in names if all(n in log for log in logs)):
             order = names.index(high) - names.index(low)
-            ratio = _ratio([(log[low], log[high], log.dt) for log in logs], order)
-            if ratio is not None:
-                yield _Ratio(low, high, order, ratio)
+            columns = [(log[low], log[high], log.dt) for log in logs]
+            yield from (_Ratio(low, (high,), order, x, high) for x in _ratio(columns, order))
+
+
+def _coordinate_rates(model: Model, log: Log) -> FloatArray:
+    """Derivatives ``(n_q, N)`` of the coordinates by the kinematics ``k(q, v)``."""
+    assert model.kinematics is not None
+    names = (*model.coordinates, *model.velocities_of_motion)
+    columns = {n: np.zeros(len(log)) for n in model.state} | {n: np.nan_to_num(log[n]) for n in names}
+    q, v = (np.stack([columns[n] for n in x]) for x in (model.coordinates, model.velocities))
+    return np.array(model.kinematics(q, v))
 
 
 def _in_unit(names: Sequence[str], unit: str, wanted: str) -> str:
@@ -305,10 +285,10 @@ def _in_unit(names: Sequence[str], unit: str, wanted: str) -> str:
     )
 
 
-def _culprits(model: Model, ratio: _Ratio) -> list[tuple[str, str, float]]:
+def _culprits(model: Model, ratio: _Ratio) -> list[tuple[tuple[str, ...], str, float]]:
     """Columns, units and factors that explain the ratio of a derivative and its column, the likeliest first."""
-    found = [(ratio.high, unit, factor, factor) for unit, factor in other_units(model.units[ratio.high])]
-    found += [(ratio.low, unit, factor, 1.0 / factor) for unit, factor in other_units(model.units[ratio.low])]
+    units = ((ratio.high, 1.0), ((ratio.low,), -1.0))
+    found = [(names, unit, x, x**way) for names, way in units for unit, x in other_units(model.units[names[0]])]
     near = [x for x in [*found, (ratio.high, "", -1.0, -1.0)] if _is_near(ratio.ratio, x[3])]
     return [x[:3] for x in sorted(near, key=lambda x: abs(np.log(ratio.ratio / x[3])))]
 
@@ -317,14 +297,14 @@ def _is_near(ratio: float, factor: float) -> bool:
     return bool(ratio / factor > 0.0 and abs(np.log(ratio / factor)) < SAME_FACTOR)
 
 
-def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) -> float | None:
-    """Ratio of the derivatives of columns and other columns of several logs; None where nothing agrees.
+def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) -> list[float]:
+    """Ratio of the derivatives of columns and other columns of several logs; none where nothing agrees.
 
     Changes over some samples are compared with integrals, which need no derivative of noise.
     """
     filled = [(_filled(low), _filled(high), dt) for low, high, dt in pairs]
     known = [(low, high, dt) for low, high, dt in filled if low is not None and high is not None]
-    least, found, tiny = EXPLAINED, None, np.finfo(float).tiny
+    least, found, tiny = EXPLAINED, list[float](), np.finfo(float).tiny
     for span in _SPANS:
         changes = [_changes(*one, order, span) for one in known if 4 * order * span <= len(one[0])]
         if not changes:
@@ -335,18 +315,17 @@ def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) ->
         middle = float(np.median(ratios)) if len(ratios) else 0.0
         scatter = float(np.median(np.abs(ratios - middle))) / (abs(middle) + tiny) if len(ratios) else np.inf
         if scatter < least:
-            least, found = scatter, middle
+            least, found = scatter, [middle]
     return found
 
 
 def _changes(low: FloatArray, high: FloatArray, dt: float, order: int, span: int) -> FloatArray:
-    """Changes (2, ..., n) of columns, and of the integrals of others, over some samples, each as often as the order."""
+    """Changes (2, n) of a column, and of the integral of another one, over some samples, each as often as the order."""
     for _ in range(order):
-        steps = np.cumsum(0.5 * dt * (high[..., 1:] + high[..., :-1]), axis=-1)
-        high = np.concatenate([np.zeros_like(steps[..., :1]), steps], axis=-1)
+        high = np.r_[0.0, np.cumsum(0.5 * dt * (high[1:] + high[:-1]))]
     both = np.stack([low, high])
     for _ in range(order):
-        both = both[..., span:] - both[..., :-span]
+        both = both[:, span:] - both[:, :-span]
     return both
 
 
