@@ -290,7 +290,7 @@ class _Task:
         options = {"given": self.given, "input_hold": self.input_hold, "priors": known.priors_of_fit}
         make = partial(_moving_dataset, model, logs, judged, pointwise=pointwise, **options)
         made_of, others = (make.args, make.keywords), [] if self.datasets is None else self.datasets
-        dataset = next((x for known, x in others if known == made_of), None) or make()
+        dataset = next((x for key, x in others if key == made_of), None) or make()
         others.append((made_of, dataset))
         fitted = 0.5 if self.compares else 0.95
         estimate = _explained(dataset, lambda: fit(self.method, dataset, self.seed, within(progress, 0.0, fitted)))

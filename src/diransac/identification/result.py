@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -48,8 +48,7 @@ class _Of(Generic[T]):
         self._name = name
 
     def __get__(self, result: Any, owner: type) -> T:
-        found: T = self if result is None else getattr(getattr(result, self._part), self._name)
-        return found
+        return cast("T", self if result is None else getattr(getattr(result, self._part), self._name))
 
 
 @dataclass(frozen=True, eq=False)

@@ -202,11 +202,11 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
             named.setdefault((unit, factor), []).append((ratio, names))
     found = list[Mistake]()
     for (unit, factor), same in named.items():
-        names, first = list(dict.fromkeys(n for _, names in same for n in names)), same[0][0]
+        columns, first = list(dict.fromkeys(n for _, names in same for n in names)), same[0][0]
         what = f"the {'second derivative' if first.order == 2 else 'derivative'} of {first.low}"
         why = f"{what} is {number(first.ratio, 3)} times {first.should_be}"
         why += f" (or the time is in {slow[0]}: --scale t={clocks[slow[0]]:g})" if slow else ""
-        found.append(Mistake(_in_unit(names, unit, model.units[names[0]]), why, _scaled(names, factor)))
+        found.append(Mistake(_in_unit(columns, unit, model.units[columns[0]]), why, _scaled(columns, factor)))
     return found
 
 
@@ -256,9 +256,9 @@ def _ratios(model: Model, logs: Sequence[Log]) -> Iterator[_Ratio]:
         chains, by_log = chains[model.n_q :], [_coordinate_rates(model, log) for log in logs]
         equations, arguments = model.kinematics.jac_sparsity(0, 1).get_triplet()
         for i, low in enumerate(model.coordinates):
-            high = tuple(list(model.velocities)[k] for row, k in zip(equations, arguments, strict=True) if row == i)
+            speeds = tuple(list(model.velocities)[k] for row, k in zip(equations, arguments, strict=True) if row == i)
             columns = [(log[low], rates[i], log.dt) for log, rates in zip(logs, by_log, strict=True)]
-            yield from (_Ratio(low, high, 1, x, "that of the kinematics") for x in _ratio(columns, 1) if high)
+            yield from (_Ratio(low, speeds, 1, x, "that of the kinematics") for x in _ratio(columns, 1) if speeds)
     for names in chains:
         for low, high in pairwise(n for n in names if all(n in log for log in logs)):
             order = names.index(high) - names.index(low)
