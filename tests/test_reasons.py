@@ -9,7 +9,6 @@ from regime_flights import REGIMES
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import motion_rows, solved
 from diransac.identification.structure.column_corrections import Correction, CorrectionTests
 from diransac.identification.structure.columns import contradictions, explanations, mistakes_of_columns
@@ -55,7 +54,7 @@ def test_columns_without_a_mistake_are_not_accused(name):
     dataset = Dataset.of(machine.model, one.log, pointwise=False)
     assert contradictions(dataset.model, dataset.given) == []
     with np.errstate(all="ignore"):
-        assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+        assert mistakes_of_columns(dataset)[0] == []
 
 
 @pytest.mark.parametrize("noise", [0.0, 30.0])
@@ -67,14 +66,14 @@ def test_equations_that_leave_most_of_their_terms_accuse_no_sign(noise):
     dataset = Dataset.of(dr.models.planar_rotorcraft(), log, pointwise=True)
     (rows,) = motion_rows(dataset)
     noisy = replace(rows, a=rows.a + noise * np.random.default_rng(0).standard_normal(rows.a.shape))
-    found, _ = explanations(CorrectionTests(dataset.model, dataset.layout, [noisy], solved_nonlinear), dataset.given)
+    found, _ = explanations(CorrectionTests(dataset.model, dataset.layout, [noisy]), dataset.given)
     assert [x.what for x in found] == ([] if noise else ["The sign of thrust is reversed"])
 
 
 def test_a_mass_that_changes_is_no_wrong_unit():
     log = of_table("rotor payload -30 %", 3000).log
     dataset = Dataset.of(REGIMES["rotor payload -30 %"].machine.model, log, pointwise=False)
-    assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+    assert mistakes_of_columns(dataset)[0] == []
 
 
 @pytest.mark.parametrize("low", ["x", "x_dot"])
@@ -117,4 +116,4 @@ def test_a_unit_that_parameters_take_up_changes_no_residual():
     )
     np.testing.assert_allclose(other.residuals, found.residuals, rtol=0.02)
     np.testing.assert_allclose(other.parameters, found.parameters * [1000.0, 1000.0, 1.0], rtol=0.02)
-    assert mistakes_of_columns(dataset, solved_nonlinear)[0] == []
+    assert mistakes_of_columns(dataset)[0] == []

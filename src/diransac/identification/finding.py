@@ -40,6 +40,11 @@ class Finding(str):
         made.level, made.action = level, action
         return made
 
+    @classmethod
+    def of(cls, level: Level, claim: str, action: str) -> Finding:
+        """A finding of a level; one that supports the result needs no action."""
+        return cls(level, f"{claim}.") if level == "good" else cls(level, claim, action)
+
     @property
     def claim(self) -> str:
         """The sentence without the action."""

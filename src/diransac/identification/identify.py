@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -244,19 +245,9 @@ class Identification:
     def by(self, method: Method, seed: int = 0) -> Result:
         """The result of a method.  Raises as `identify` does."""
         _check_arguments(self._known.model, seed)
-        several = len(self._given) > 1
-        task = _Task(self._known, self._given, method, int(seed), None, several, self._dataset)
+        task = _Task(self._known, self._given, method, int(seed), None, len(self._given) > 1, self._datasets)
         with numerical_failures(self._given):
             return task.fitted(self._given)[0]
-
-    def _dataset(self, *arguments: Any, **options: Any) -> Dataset:
-        """The dataset of an earlier method with the same arguments of `Dataset.of`, or a new one."""
-        for known, dataset in self._datasets:
-            if known == (arguments, options):
-                return dataset
-        dataset = _moving_dataset(*arguments, **options)
-        self._datasets.append(((arguments, options), dataset))
-        return dataset
 
 
 def _moving_dataset(*arguments: Any, **options: Any) -> Dataset:
@@ -278,7 +269,8 @@ class _Task:
     seed: int
     input_hold: str | None
     compares: bool
-    dataset_of: Callable[..., Dataset] = _moving_dataset
+    datasets: list[tuple[object, Dataset]] | None = None
+    """Those of earlier methods with all that they were made of, which this one's is taken from and added to."""
 
     @single_threaded()  # matrices are small: more threads would only wait for one another
     def run(self, logs: Sequence[Log], progress: Callback | None = None) -> Result:
@@ -295,15 +287,11 @@ class _Task:
         known, unused = self._observed(logs)
         criteria, model = self.method.criteria, known.free()
         judged = judged_signals(model, logs, criteria)
-        dataset = self.dataset_of(
-            model,
-            logs,
-            judged,
-            pointwise=pointwise,
-            given=self.given,
-            input_hold=self.input_hold,
-            priors=known.priors_of_fit,
-        )
+        options = {"given": self.given, "input_hold": self.input_hold, "priors": known.priors_of_fit}
+        make = partial(_moving_dataset, model, logs, judged, pointwise=pointwise, **options)
+        made_of, others = (make.args, make.keywords), [] if self.datasets is None else self.datasets
+        dataset = next((x for key, x in others if key == made_of), None) or make()
+        others.append((made_of, dataset))
         fitted = 0.5 if self.compares else 0.95
         estimate = _explained(dataset, lambda: fit(self.method, dataset, self.seed, within(progress, 0.0, fitted)))
         report(progress, "evaluating", fitted)
@@ -368,46 +356,33 @@ class _Task:
 
     def with_sensitivity(self, result: Result, derived: Sequence[Log], progress: Callback | None) -> Result:
         """The result with each parameter's relative change at half and twice the bandwidth of every log."""
-        chosen = [log.filter.bandwidth for log in derived if log.filter is not None]
-        changes = []
+        chosen, changes = [log.filter.bandwidth for log in derived if log.filter is not None], list[dict[str, float]]()
         for k, factor in enumerate((0.5, 2.0)):
             part = within(progress, 0.4 + 0.3 * k, 0.7 + 0.3 * k, f"{factor:g} x bandwidth: ")
             try:
-                changes.append(self._change(result, [factor * x for x in chosen], part))
+                pairs = zip(self.given, chosen, strict=True)
+                logs = [preprocessing.differentiate(log, self.known.model, factor * x) for log, x in pairs]
+                other = dataclasses.replace(self, compares=False).fitted(logs, part)[0].parameters
+                check_time()
             except TimeLimitError:
                 note = "the time limit was reached before the bandwidth of the filter was varied"
                 return dataclasses.replace(result, notes=(*result.notes, note))
+            except DiransacError:  # nothing was identified there
+                other = dict.fromkeys(result.parameters, np.nan)
+            changes.append({n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()})
         report(progress, "done", 1.0)
-        pairs = {n: (changes[0][n], changes[1][n]) for n in result.parameters if n not in result.fixed}
-        return dataclasses.replace(result, bandwidth_sensitivity=pairs)
-
-    def _change(self, result: Result, bandwidths: Sequence[float], progress: Callback | None) -> dict[str, float]:
-        """Relative change of each parameter at other bandwidths; NaN where nothing was identified there.
-
-        Raises TimeLimitError: the time limit was reached.
-        """
-        alone = dataclasses.replace(self, compares=False)
-        try:
-            pairs = zip(self.given, bandwidths, strict=True)
-            derived = [preprocessing.differentiate(log, self.known.model, x) for log, x in pairs]
-            other = alone.fitted(derived, progress)[0].parameters
-            check_time()
-        except TimeLimitError:
-            raise
-        except DiransacError:
-            return dict.fromkeys(result.parameters, np.nan)
-        return {n: (other[n] - x) / abs(x) if x else np.inf for n, x in result.parameters.items()}
+        sensitivity = {n: (changes[0][n], changes[1][n]) for n in result.parameters if n not in result.fixed}
+        return dataclasses.replace(result, bandwidth_sensitivity=sensitivity)
 
 
 def _mistakes(dataset: Dataset, *, delays: bool = True) -> tuple[list[Mistake], int]:
     """Mistakes of columns that explain the logs, and the number of those tested; none without equations."""
     if not dataset.model.has_equations:
         return [], 0
-    from diransac.identification.regression.nonlinear import solved_nonlinear
 
     def found() -> tuple[list[Mistake], int]:
         with np.errstate(all="ignore"):  # a correction that overflows explains nothing
-            return mistakes_of_columns(dataset, solved_nonlinear, delays=delays)
+            return mistakes_of_columns(dataset, delays=delays)
 
     try:
         return dataset.kept(("mistakes of columns", delays), found)
@@ -436,22 +411,19 @@ def _with_tested_columns(result: Result, dataset: Dataset) -> Result:
     if not dataset.model.has_equations:
         return result
     left = (x for one in result.logs if one.prediction for x in one.prediction.unexplained.values())
-    is_bad, n_tested = result.verdict == "do not rely on this", 0
-    parameters = result.model.parameters
-    tested = result.estimate.possible_terms is not None
-    intervals = result.structural_intervals() if tested else result.intervals()
-    lost = [n for n, (low, high) in intervals.items() if low <= 0.0 <= high and not parameters[n].admits(0.0)]
+    is_bad, n_tested, parameters = result.verdict == "do not rely on this", 0, result.model.parameters
+    intervals = result.structural_intervals() if result.has_structure else result.intervals()
+    lost = any(low <= 0.0 <= high and not parameters[n].admits(0.0) for n, (low, high) in intervals.items())
     # A quarter of an acceleration that is unexplained is a reason to test columns.
-    is_doubtful = is_bad or bool(lost) or max(left, default=0.0) > 0.25 or result.verdict != "usable"
+    is_doubtful = result.verdict != "usable" or lost or max(left, default=0.0) > 0.25
     if is_doubtful:
         mistakes, n_tested = _mistakes(dataset, delays=not result.separates_forces)
     else:
         mistakes = contradictions(dataset.model, dataset.given)
     found = [Finding("bad" if is_bad or (is_doubtful and x.explains) else "care", x.claim, x.action) for x in mistakes]
-    if not found and not n_tested:
+    if not (found or n_tested):
         return result
-    n_others = 0 if found else n_tested
-    estimate = dataclasses.replace(result.estimate, mistakes=tuple(found), n_columns_tested=n_others)
+    estimate = dataclasses.replace(result.estimate, mistakes=tuple(found), n_columns_tested=0 if found else n_tested)
     return dataclasses.replace(result, estimate=estimate)
 
 
@@ -460,17 +432,16 @@ def _predicts_as_well(other: Result, found: Result) -> bool:
 
     A result without competition predicts the logs within their noise, so that there are no held-out blocks.
     """
-    with_terms, without = (None if x.competition is None else x.competition.competitors for x in (other, found))
-    if with_terms and without and min(x.score for x in with_terms) > min(x.score for x in without):
+    both = [() if x.competition is None else x.competition.competitors for x in (other, found)]
+    if all(both) and min(x.score for x in both[0]) > min(x.score for x in both[1]):
         return False
     if other.predictions is None or found.predictions is None:
         return found.predictions is None
-    errors = [
-        {x.horizon: max(x.relative_error.values(), default=0.0) for x in scored.horizons}
+    with_terms, without = (
+        np.median([max(x.relative_error.values(), default=0.0) for x in scored.horizons])
         for scored in (other.predictions, found.predictions)
-    ]
-    typical = [float(np.median(list(x.values()))) for x in errors]
-    return typical[0] <= max(typical[1], NEAR)
+    )
+    return bool(with_terms <= max(without, NEAR))
 
 
 def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
@@ -491,13 +462,13 @@ def _with_predictions(result: Result, logs: Sequence[Log]) -> Result:
         return result
     pairs = zip(result.estimate.disagreements, effects, strict=True)
     known = tuple(dataclasses.replace(x, effect=effect) for x, effect in pairs)
-    tested = dataclasses.replace(result, estimate=dataclasses.replace(result.estimate, disagreements=known))
-    noticed = tuple(x for x, _ in noticed_disagreements(tested))
+    estimate = dataclasses.replace(result.estimate, disagreements=known)
+    noticed = tuple(x for x, _ in noticed_disagreements(dataclasses.replace(result, estimate=estimate)))
     claims = [x.claim for x in noticed]
     return dataclasses.replace(
         result,
         predictions=found,
-        estimate=dataclasses.replace(result.estimate, disagreements=noticed),
+        estimate=dataclasses.replace(estimate, disagreements=noticed),
         logs=tuple(x if x.remark in claims else dataclasses.replace(x, remark="") for x in result.logs),
     )
 
@@ -508,23 +479,20 @@ def _summaries(
     named: Sequence[Disagreement],
     predicted: Sequence[Prediction | None],
 ) -> tuple[LogSummary, ...]:
-    scores = zip(evaluation.fit_errors.tolist(), evaluation.inlier_fractions.tolist(), strict=True)
     claims = {x.log: x.claim for x in named}
-    remarks = [claims.get(i, "") for i in range(len(dataset.given))]
-    parts = zip(dataset.given, dataset.segments, scores, remarks, predicted, strict=True)
     return tuple(
         LogSummary(
-            log.source,
-            log.fingerprint,
-            float(log.time[0]),
-            log.dt,
-            len(log),
-            tuple(dict(step) for step in one.log.history),
-            error,
-            fraction,
-            remark,
-            one.log.fingerprint,
-            prediction,
+            source=log.source,
+            fingerprint=log.fingerprint,
+            start=float(log.time[0]),
+            dt=log.dt,
+            n_rows=len(log),
+            preparation=tuple(dict(step) for step in dataset.segments[i].log.history),
+            fit_error=float(evaluation.fit_errors[i]),
+            inlier_fraction=float(evaluation.inlier_fractions[i]),
+            remark=claims.get(i, ""),
+            prepared_fingerprint=dataset.segments[i].log.fingerprint,
+            prediction=predicted[i],
         )
-        for log, one, (error, fraction), remark, prediction in parts
+        for i, log in enumerate(dataset.given)
     )

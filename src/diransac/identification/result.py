@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from diransac.identification.evaluation.findings import findings_of
 from diransac.identification.finding import Finding, Verdict, verdict_of
 from diransac.identification.regression.uncertainty import student_quantile, students_draws, two_sided
 from diransac.identification.result_text import html_of, text_of
+from diransac.identification.serialization import Form, NumberPairs
 from diransac.identification.settings import Settings
 from diransac.identification.structure.lacking_terms import (
     PossibleTerm,
@@ -33,6 +34,21 @@ from diransac.identification.structure.lacking_terms import (
 from diransac.model import Model
 from diransac.model.parameter import parameter_of
 from diransac.plain_data import json_data, read_text
+
+T = TypeVar("T")
+
+
+class _Of(Generic[T]):
+    """An attribute of a part of a result, under the same name."""
+
+    def __init__(self, part: str) -> None:
+        self._part = part
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, result: Any, owner: type) -> T:
+        return cast("T", self if result is None else getattr(getattr(result, self._part), self._name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,19 +88,46 @@ class Result:
         Open-loop predictions of the logs; None where they were not scored.
     """
 
-    model: Model
+    model: Annotated[Model, Form(lambda model: model.to_dict(), result_files.model_of)]
     method: str
     seed: int
-    settings: Settings
+    settings: Annotated[Settings, Form(Settings.to_dict, Settings.from_dict)]
     estimate: Estimate
     evaluation: Evaluation
     logs: tuple[LogSummary, ...]
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
-    bandwidth_sensitivity: Mapping[str, tuple[float, float]] | None = None
+    bandwidth_sensitivity: NumberPairs | None = None
     fixed: tuple[str, ...] = ()
-    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    priors: NumberPairs = field(default_factory=dict)
     predictions: Predictions | None = None
+
+    degrees_of_freedom = _Of[int]("estimate")
+    """Degrees of freedom of the covariance."""
+    n_fitted = _Of[int]("estimate")
+    """Number of observations that the parameters were fitted to: of a sample, or of a set of inliers."""
+    estimator = _Of[str]("estimate")
+    """Name of the estimator."""
+    iterations = _Of[int]("estimate")
+    """Number of samples drawn, the paper's k."""
+    n_hypotheses = _Of[int]("estimate")
+    """Number of hypotheses evaluated, refits included."""
+    rejected = _Of[Mapping[str, int]]("estimate")
+    """Number of rejected hypotheses by reason."""
+    stop_reason = _Of[str]("estimate")
+    """Reason why the search ended."""
+    diagnosis = _Of[Diagnosis | None]("estimate")
+    """Noise, faults and unmodelled forces, from lo-diransac."""
+    suggestions = _Of[tuple[Suggestion, ...]]("estimate")
+    """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
+    competition = _Of[Competition | None]("estimate")
+    """Comparison of estimates by held-out prediction, from lo-diransac; None where there was no need of one."""
+    fit_error = _Of[float]("evaluation")
+    """Fit error of the parameters, eq. (2), or its mean square for DIRANSAC; NaN if nothing could be simulated."""
+    inlier_fraction = _Of[float]("evaluation")
+    """Number of inliers over the number of rows that count."""
+    inliers = _Of[BoolArray]("evaluation")
+    """Inliers ``(N,)`` among the rows of the given logs, log after log."""
 
     @cached_property
     def layout(self) -> ParameterLayout:
@@ -366,46 +409,6 @@ class Result:
         return [] if self.diagnosis is None else list(self.diagnosis.known_up_to)
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """Degrees of freedom of the covariance."""
-        return self.estimate.degrees_of_freedom
-
-    @property
-    def n_fitted(self) -> int:
-        """Number of observations that the parameters were fitted to: of a sample, or of a set of inliers."""
-        return self.estimate.n_fitted
-
-    @property
-    def estimator(self) -> str:
-        """Name of the estimator."""
-        return self.estimate.estimator
-
-    @property
-    def iterations(self) -> int:
-        """Number of samples drawn, the paper's k."""
-        return self.estimate.iterations
-
-    @property
-    def n_hypotheses(self) -> int:
-        """Number of hypotheses evaluated, refits included."""
-        return self.estimate.n_hypotheses
-
-    @property
-    def rejected(self) -> Mapping[str, int]:
-        """Number of rejected hypotheses by reason."""
-        return self.estimate.rejected
-
-    @property
-    def stop_reason(self) -> str:
-        """Reason why the search ended."""
-        return self.estimate.stop_reason
-
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """Noise, faults and unmodelled forces, from lo-diransac."""
-        return self.estimate.diagnosis
-
-    @property
     def noise(self) -> Mapping[str, float]:
         """Standard deviation of the noise of each signal, and of the inputs that show it; empty without a diagnosis."""
         return {} if self.diagnosis is None else {**self.diagnosis.noise_std, **self.diagnosis.input_noise}
@@ -414,31 +417,6 @@ class Result:
     def separates_forces(self) -> bool:
         """True if the method separates unmodelled forces from noise; a simulation of a whole log adds them up."""
         return self.diagnosis is not None
-
-    @property
-    def suggestions(self) -> tuple[Suggestion, ...]:
-        """Terms that would explain the unmodelled forces, the most likely first; from lo-diransac."""
-        return self.estimate.suggestions
-
-    @property
-    def competition(self) -> Competition | None:
-        """Comparison of estimates by held-out prediction, from lo-diransac; None where there was no need of one."""
-        return self.estimate.competition
-
-    @property
-    def fit_error(self) -> float:
-        """Fit error of the parameters, eq. (2), or its mean square for DIRANSAC; NaN if nothing could be simulated."""
-        return self.evaluation.fit_error
-
-    @property
-    def inlier_fraction(self) -> float:
-        """Number of inliers over the number of rows that count."""
-        return self.evaluation.inlier_fraction
-
-    @property
-    def inliers(self) -> BoolArray:
-        """Inliers ``(N,)`` among the rows of the given logs, log after log."""
-        return self.evaluation.inliers
 
     def log_rows(self, i: int) -> slice:
         """Rows of log ``i`` among the rows of all logs."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +11,10 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.atomic import write_text
-from diransac.data.dataset import ParameterLayout
 from diransac.errors import ResultError, SettingsError
 from diransac.identification.diagnosis import Resolution
-from diransac.identification.estimate import Estimate, Evaluation, LogSummary, Predictions
+from diransac.identification.estimate import Estimate, Evaluation
 from diransac.identification.serialization import NumberPairs, Numbers, Series, Values, dump, load
-from diransac.identification.settings import Settings
 from diransac.identification.structure.lacking_terms import check_terms
 from diransac.model import Model
 from diransac.simulation import HOLDS
@@ -27,49 +24,25 @@ if TYPE_CHECKING:
     from diransac.identification.result import Result
 
 _FORMAT = 11
+"""Number of the form of the JSON."""
 _SINCE: Mapping[int, Mapping[str, object]] = {
     9: {"mistakes": (), "n_columns_tested": 0, "predictions": None, "disagreements": ()},
     10: {"predictions": None, "disagreements": ()},
 }
 """Formats that are read besides, with the values of what they lack."""
-_BY_LOG = ("parameters", "covariance")
-"""Fields of an estimate that its JSON keeps apart from those of the result, where parameters are per log."""
-_ROUNDING = 1e-3
-"""Errors of correlations, by far: those of collinear parameters come from matrices that are nearly singular."""
-
-
-@dataclass(frozen=True)
-class _Provenance:
-    """Provenance of a result in its JSON."""
-
-    method: str
-    seed: int
-    logs: tuple[LogSummary, ...]
-    notes: tuple[str, ...]
-    options: Mapping[str, Any]
-    bandwidth_sensitivity: NumberPairs | None
-    fixed: tuple[str, ...]
-    priors: NumberPairs
-    predictions: Predictions | None
 
 
 def as_dict(result: Result) -> dict[str, Any]:
     """Everything, ready for JSON; `from_data` reads it back."""
-    estimate = dump(result.estimate)
+    data = dump(result)
+    # Fields of the estimate and the evaluation stand beside the result's, whose notes hold the estimate's, too.
+    estimate, evaluation = data.pop("estimate"), data.pop("evaluation")
     if not result.layout.is_shared:
-        estimate |= {f"{key}_of_logs": estimate[key] for key in _BY_LOG}
+        estimate |= {f"{key}_of_logs": estimate[key] for key in ("parameters", "covariance")}
         estimate |= {"parameters": dump(result.parameters, Values), "covariance": dump(result.covariance, Numbers)}
         estimate["per_log"] = dump({n: np.array(x) for n, x in result.per_log.items()}, Series)
-    return {
-        "format": _FORMAT,
-        **estimate,
-        **dump(result.evaluation),
-        # Its notes hold the estimate's, too.
-        **dump(_Provenance(**{n: getattr(result, n) for n in _Provenance.__dataclass_fields__})),
-        **_derived(result),
-        "settings": result.settings.to_dict(),
-        "model": result.model.to_dict(),
-    }
+    model = {"model": data.pop("model")}
+    return {"format": _FORMAT, **estimate, **evaluation, **data, **_derived(result), **model}
 
 
 def _derived(result: Result) -> dict[str, Any]:
@@ -79,7 +52,7 @@ def _derived(result: Result) -> dict[str, Any]:
         "units": result.units,
         "standard_errors": dump(result.standard_errors, Values),
         "intervals_95": dump(result.intervals(), NumberPairs),
-        "structural_intervals_95": None if structural is None else dump(structural, NumberPairs),
+        "structural_intervals_95": dump(structural, NumberPairs | None),
         "structure": {n: dump(x) for n, x in result.structure.items()} if result.has_structure else None,
         "violations": list(result.violations),
         "verdict": result.verdict,
@@ -87,8 +60,8 @@ def _derived(result: Result) -> dict[str, Any]:
     }
 
 
-def from_data(data: object, make: Callable[..., Result]) -> Result:
-    """The result that ``make`` returns from the fields in a mapping of `as_dict`.  Raises as `Result.from_dict`."""
+def from_data(data: object, kind: type[Result]) -> Result:
+    """The result from a mapping of `as_dict`.  Raises as `Result.from_dict`."""
     found = data.get("format") if isinstance(data, Mapping) else None
     if type(found) is not int:
         raise ResultError("this is no result of diransac; give a file that identify wrote")
@@ -99,43 +72,43 @@ def from_data(data: object, make: Callable[..., Result]) -> Result:
             "Identify again"
         )
     assert isinstance(data, Mapping)
+    own = {
+        **_SINCE.get(found, {}),
+        **data,
+        **{n.removesuffix("_of_logs"): x for n, x in data.items() if n.endswith("_of_logs")},
+    }
     try:
-        return _checked({**_SINCE.get(found, {}), **data}, make)
+        result = load(kind, {**own, "estimate": load(Estimate, own), "evaluation": load(Evaluation, own)})
+        _check(result)
+        _derived(result), str(result)  # fail where names and figures do not fit together
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
         reason = str(error).partition("\n")[0]
         raise ResultError(f"the result is damaged: {type(error).__name__} at {reason:.200}; identify again") from error
+    return result
 
 
-def _checked(data: Mapping[str, Any], make: Callable[..., Result]) -> Result:
-    """Result from data of the latest format.  Raises ValueError and others: names, figures or sizes do not fit."""
-    data = {**data, **{key: data[f"{key}_of_logs"] for key in _BY_LOG if f"{key}_of_logs" in data}}
-    model, plain = _model(data["model"]), load(_Provenance, data)
-    estimate, evaluation = load(Estimate, data), load(Evaluation, data)
-    layout = ParameterLayout(model.parameters, len(plain.logs))
-    if tuple(estimate.parameters) != layout.names or not np.isfinite(estimate.values).all():
+def _check(result: Result) -> None:
+    """Raise ValueError: names, figures or sizes do not fit."""
+    estimate, n_rows = result.estimate, sum(log.n_rows for log in result.logs)
+    if tuple(estimate.parameters) != result.layout.names or not np.isfinite(estimate.values).all():
         raise ValueError(f"parameters {', '.join(estimate.parameters)}")
-    n_rows = sum(log.n_rows for log in plain.logs)
     masks = [] if estimate.diagnosis is None else estimate.diagnosis.outliers.values()
-    if any(len(mask) != n_rows for mask in (evaluation.inliers, *masks)):
+    if any(len(mask) != n_rows for mask in (result.inliers, *masks)):
         raise ValueError(f"a mask of other than {n_rows} rows")
     if estimate.diagnosis is not None:
         estimate.diagnosis.check_windows()
     check_terms(estimate.possible_terms or ())
     if not _is_covariance(estimate.covariance):
         raise ValueError("covariance: it is that of no distribution")
-    _check_resolution(estimate.resolution, model.n_u)
+    _check_resolution(estimate.resolution, result.model.n_u)
     if not 1 <= estimate.degrees_of_freedom <= 2**53:
         raise ValueError(f"{estimate.degrees_of_freedom} degrees of freedom")
-    for log in plain.logs:
+    for log in result.logs:
         if not (log.n_rows > 0 and 0.0 < log.dt < np.inf and np.isfinite(log.start)):
             raise ValueError(f"a log of {log.n_rows} rows, {log.dt} s apart")
-    settings = Settings.from_dict(data["settings"])
-    found = make(model, estimate=estimate, evaluation=evaluation, settings=settings, **vars(plain))
-    _derived(found), str(found)  # fail where names and figures do not fit together
-    return found
 
 
-def _model(data: Mapping[str, Any]) -> Model:
+def model_of(data: Mapping[str, Any]) -> Model:
     """The stored model, with equations or of a simulator."""
     if "simulator" not in data:
         return Model.from_dict(data)
@@ -158,16 +131,16 @@ def _check_resolution(resolution: Resolution, n_u: int) -> None:
 
 def _is_covariance(covariance: FloatArray) -> bool:
     """True if variances are not negative, and the correlations of those that are finite are symmetric and definite."""
-    variances = np.diag(covariance)
+    variances, rounding = np.diag(covariance), 1e-3  # by far: those of collinear parameters are nearly singular
     if (variances < 0.0).any():
         return False
     known = np.isfinite(variances) & (variances > 0.0)
     deviations = np.sqrt(variances[known])
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         correlation = covariance[np.ix_(known, known)] / deviations[:, None] / deviations
-    if not np.isfinite(correlation).all() or np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDING:
+    if not np.isfinite(correlation).all() or np.abs(correlation - correlation.T).max(initial=0.0) > rounding:
         return False
-    return bool(np.linalg.eigvalsh(correlation).min(initial=0.0) >= -_ROUNDING)
+    return bool(np.linalg.eigvalsh(correlation).min(initial=0.0) >= -rounding)
 
 
 def export(
@@ -191,24 +164,17 @@ def export(
 
 
 def _write_description(result: Result, path: str | Path, into: str | Path) -> tuple[str, ...]:
-    """Write a description; return the parameters that are not in it."""
-    found = result.parameters.items()
-    values = np.array([np.nan if name in result.unidentifiable else x for name, x in found])
-    text, left_out = _calibrated(result, into, values)
-    write(path, text)
-    return left_out
-
-
-def _calibrated(result: Result, into: str | Path, values: FloatArray) -> tuple[str, tuple[str, ...]]:
-    """Text of a description with values in it, and the parameters that are not."""
+    """Write a description with identifiable parameters in it; return those that are not."""
     from diransac.model.mjcf import MujocoModel, calibrated_text
     from diransac.model.robots.calibration import calibrated
 
-    model = result.model
-    if isinstance(model, MujocoModel):
-        named = dict(zip(model.parameters, values.tolist(), strict=True))
-        return calibrated_text(into, model, named, result.covariance)
-    return calibrated(into, model.parameters, values, result.covariance)
+    values = {n: np.nan if n in result.unidentifiable else x for n, x in result.parameters.items()}
+    if isinstance(result.model, MujocoModel):
+        text, left_out = calibrated_text(into, result.model, values, result.covariance)
+    else:
+        text, left_out = calibrated(into, result.model.parameters, np.array(list(values.values())), result.covariance)
+    write(path, text)
+    return left_out
 
 
 def _portable(result: Result, name: str | None = None) -> PortableModel:

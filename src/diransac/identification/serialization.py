@@ -38,11 +38,12 @@ class Form:
         except (TypeError, AttributeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
-    def by_name(self) -> Form:
-        """The form of a mapping from names to such values."""
-        return Form(
-            lambda values: {str(name): self.encode(x) for name, x in values.items()},
-            lambda data: {str(name): self.decode(x) for name, x in data.items()},
+    @classmethod
+    def by_name(cls, encode: Callable[[Any], Any], decode: Callable[[Any], Any]) -> Form:
+        """The form of a mapping from names to values that have these forms."""
+        return cls(
+            lambda values: {str(name): encode(x) for name, x in values.items()},
+            lambda data: {str(name): decode(x) for name, x in data.items()},
         )
 
 
@@ -87,31 +88,21 @@ def _decode_mask(data: Any) -> BoolArray:
     return np.unpackbits(packed, count=n_rows).astype(bool)
 
 
-def _decode_pair(data: Any) -> tuple[float, float]:
-    first, second = data
-    return _decode_number(first), _decode_number(second)
-
-
-_NUMBER, _NUMBERS = Form(_encode_number, _decode_number), Form(_encode_numbers, _decode_numbers)
-_MASK = Form(_encode_mask, _decode_mask)
-
-Number = Annotated[float, _NUMBER]
+Number = Annotated[float, Form(_encode_number, _decode_number)]
 """A number that may be infinite or NaN."""
-Numbers = Annotated[FloatArray, _NUMBERS]
+Numbers = Annotated[FloatArray, Form(_encode_numbers, _decode_numbers)]
 """An array of numbers of any shape, as nested lists."""
 WholeNumbers = Annotated[IntArray, Form(lambda values: values.tolist(), _decode_whole_numbers)]
 """An array ``(n,)`` of whole numbers."""
-Mask = Annotated[BoolArray, _MASK]
+Mask = Annotated[BoolArray, Form(_encode_mask, _decode_mask)]
 """An array ``(N,)`` of Booleans, packed."""
-Values = Annotated[Mapping[str, float], _NUMBER.by_name()]
+Values = Annotated[Mapping[str, float], Form.by_name(_encode_number, _decode_number)]
 """Numbers by name."""
-NumberPairs = Annotated[
-    Mapping[str, tuple[float, float]], Form(lambda pair: [_encode_number(x) for x in pair], _decode_pair).by_name()
-]
+NumberPairs = Mapping[str, tuple[Number, Number]]
 """Pairs of numbers by name."""
-Series = Annotated[Mapping[str, FloatArray], _NUMBERS.by_name()]
+Series = Annotated[Mapping[str, FloatArray], Form.by_name(_encode_numbers, _decode_numbers)]
 """Arrays by name."""
-Masks = Annotated[Mapping[str, BoolArray], _MASK.by_name()]
+Masks = Annotated[Mapping[str, BoolArray], Form.by_name(_encode_mask, _decode_mask)]
 """Masks by name."""
 
 

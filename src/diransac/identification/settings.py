@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+import operator
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,49 +90,20 @@ class Settings:
     batch_size: int = 256
 
     def __post_init__(self) -> None:
-        for name in ("sample_size", "max_iterations", "substeps", "batch_size"):
-            object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
-        for name in ("min_inlier_signals", "threads"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, _positive_integer(name, getattr(self, name)))
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None or "None" not in str(field.type):
+                object.__setattr__(self, field.name, _checked(field.name, value))
         check_substeps(self.substeps)
-        if self.stop_inlier_fraction is not None:
-            fraction = _fraction("stop_inlier_fraction", self.stop_inlier_fraction)
-            object.__setattr__(self, "stop_inlier_fraction", fraction)
-        for name in ("inlier_thresholds", "error_weights"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, _by_name(name, getattr(self, name), 0.0))
-        self._check_acceptance()
-        _one_of("refit", self.refit, ("inliers", "none"))
-        _one_of("integrator", self.integrator, tuple(INTEGRATORS))
-        if isinstance(self.initial_state, Mapping):
-            object.__setattr__(self, "initial_state", _by_name("initial_state", self.initial_state, -np.inf))
-        else:
-            _one_of("initial_state", self.initial_state, ("first", "robust"))
-
-    def _check_acceptance(self) -> None:
-        try:
-            weights = tuple(float(x) for x in self.acceptance_weights)
-        except (TypeError, ValueError) as error:
-            raise SettingsError(f"acceptance_weights is {self.acceptance_weights!r}; give (nu_e, nu_f)") from error
-        if len(weights) != 2 or not all(0.0 <= x < np.inf for x in weights) or not any(weights):
-            raise SettingsError(
-                f"acceptance_weights is {self.acceptance_weights!r}; give (nu_e, nu_f), none negative, not both zero"
-            )
-        object.__setattr__(self, "acceptance_weights", weights)
 
     @classmethod
     def table_iv(cls) -> Settings:
         """Table IV of the paper, for the planar rotorcraft."""
         rates, accelerations = ("x_dot", "z_dot", "theta_dot"), ("x_ddot", "z_ddot", "theta_ddot")
         return cls(
-            sample_size=75,
-            max_iterations=1000,
-            stop_inlier_fraction=0.85,
             inlier_thresholds=dict.fromkeys((*rates, *accelerations), 0.5),
             min_inlier_signals=3,
             error_weights={**dict.fromkeys(rates, 1.0), **dict.fromkeys(accelerations, 0.1)},
-            acceptance_weights=(1.0, 0.06),
         )
 
     def changed(self) -> tuple[str, ...]:
@@ -210,42 +182,48 @@ def check_used(settings: Settings, used: Collection[str], method: str) -> None:
         )
 
 
-def _positive_integer(name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise SettingsError(f"{name} is {value!r}; give a whole number of at least 1")
-    return int(value)
-
-
 def check_substeps(substeps: int) -> None:
     """Raise SettingsError: there are more integration steps per sample than any machine needs."""
     if substeps > MOST_SUBSTEPS:
         raise SettingsError(f"substeps is {substeps!s:.20}; give up to {MOST_SUBSTEPS} integration steps per sample")
 
 
-def _fraction(name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value <= 1.0:
-        raise SettingsError(f"{name} is {value!r}; give a number above 0 and up to 1, or None")
-    return float(value)
-
-
-def _one_of(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise SettingsError(f"{name} is {value!r}; choose {', '.join(choices)}")
-
-
-def _by_name(name: str, values: object, lower: float) -> dict[str, float]:
-    """A plain dict of finite numbers, none below ``lower``."""
-    if not isinstance(values, Mapping):
-        raise SettingsError(f"{name} is {values!r}; give a mapping from signal to number")
+def _checked(name: str, value: object) -> object:
+    """The value of a setting in its plain type.  Raises SettingsError: it has no meaning."""
+    signals = "a mapping from signal to finite number"
+    sizes = (f"{signals}, none negative", _numbers, lambda x: min(x.values(), default=0.0) >= 0.0)
+    rules: dict[str, tuple[str, Callable[[Any], Any], Callable[[Any], bool]]] = {
+        "stop_inlier_fraction": ("a number above 0 and up to 1, or None", lambda x: float(x / 1), lambda x: 0 < x <= 1),
+        "inlier_thresholds": sizes,
+        "error_weights": sizes,
+        "acceptance_weights": (
+            "(nu_e, nu_f), none negative, not both zero",
+            lambda x: tuple(float(weight) for weight in x),
+            lambda x: len(x) == 2 and all(0.0 <= weight < np.inf for weight in x) and any(x),
+        ),
+        "refit": ("inliers or none", str, ("inliers", "none").__contains__),
+        "integrator": (" or ".join(INTEGRATORS), str, INTEGRATORS.__contains__),
+        "initial_state": (
+            f"first, robust, or {signals}",
+            lambda x: x if x in ("first", "robust") else _numbers(x),
+            lambda _: True,
+        ),
+    }
+    wanted, plain, holds = rules.get(name, ("a whole number of at least 1", operator.index, lambda x: x >= 1))
     try:
-        numbers = {str(k): float(v) for k, v in values.items()}
-    except (TypeError, ValueError) as error:
-        raise SettingsError(f"{name} is {dict(values)!r}; give a number for each signal") from error
-    for signal, x in numbers.items():
-        if not np.isfinite(x) or x < lower:
-            raise SettingsError(
-                f"{name}: {signal} is {x}; give a finite number" + (" of at least 0" if lower == 0.0 else "")
-            )
+        found = plain(value)
+    except (TypeError, ValueError, AttributeError):
+        found = None
+    if found is None or isinstance(value, bool) or not holds(found):
+        raise SettingsError(f"{name} is {value!r}; give {wanted}")
+    return found
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """A plain dict of finite numbers.  Raises ValueError: one is none."""
+    numbers = {str(name): float(x) for name, x in values.items()}
+    if not np.isfinite(list(numbers.values())).all():
+        raise ValueError
     return numbers
 
 

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Parameter
 
-_LITTLE = 0.05
-"""Share of an acceleration that may be unexplained."""
-_HALF = 0.5
 _LISTED = 3
 """Stretches that a sentence names; parameters that a term may change of which there is a finding."""
 _OTHER_BANDWIDTH = "choose another bandwidth (--bandwidth), or identify with --method lo-diransac"
@@ -82,36 +79,29 @@ def _lacking(result: Result, predicted: Sequence[Finding]) -> Iterator[Finding]:
 
 
 def _bounds(result: Result) -> Iterator[Finding]:
-    parameters = result.model.parameters
-    for name in result.violations:
-        bounds = parameters[parameter_of(name, parameters)]
-        value = f"{name} = {number(result.estimate.parameters[name])} {bounds.unit}"
-        claim = f"{value} is outside its bounds ({bounds_text(bounds)}), which is physically impossible"
-        yield Finding("bad", claim, _remedy(result, "bad"))
-    yield from _on_bounds(result)
-    bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
-    if bounded and not (result.violations or result.on_bounds):
-        yield Finding("note", "Every parameter is within its bounds.")
-
-
-def _on_bounds(result: Result) -> Iterator[Finding]:
-    """Parameters at which a bound stopped the fit.
+    """Parameters outside of their bounds, and on one of them.
 
     A bound that a parameter may have is no contradiction where the logs are predicted well with it; then nothing
     changes if it is fixed there.  Where they are not, the bound hides what the model lacks.
     """
-    parameters, found = result.model.parameters, result.predictions
-    good = found is not None and max(found.judged.relative_error.values(), default=np.inf) <= NEAR
-    for name in result.on_bounds:
-        value, own = result.estimate.parameters[name], parameters[parameter_of(name, parameters)]
-        claim = f"{name} = {number(value)} is on its bound, where the fit was stopped, so that its interval is unknown"
-        if not good:
+    parameters, predicted = result.model.parameters, result.predictions
+    good = predicted is not None and max(predicted.judged.relative_error.values(), default=np.inf) <= NEAR
+    for name in (*result.violations, *result.on_bounds):
+        own, x = parameters[parameter_of(name, parameters)], result.estimate.parameters[name]
+        claim = f"{name} = {number(x)} is on its bound, where the fit was stopped, so that its interval is unknown"
+        if name in result.violations:
+            bounds = f"outside its bounds ({bounds_text(own)}), which is physically impossible"
+            yield Finding("bad", f"{name} = {number(x)} {own.unit} is {bounds}", _remedy(result, "bad"))
+        elif not good:
             yield Finding("bad", claim, _remedy(result, "bad"))
-        elif own.admits(value):
-            kept = f"fix it, which changes no prediction: --fix {name.partition('[')[0]}={number(value)}"
+        elif own.admits(x):
+            kept = f"fix it, which changes no prediction: --fix {name.partition('[')[0]}={number(x)}"
             yield Finding("note", f"{claim}; predictions are good with it; {kept}.")
         else:
             yield Finding("care", claim, "widen the bound")
+    bounded = any(bounds_text(x) for n, x in parameters.items() if n not in result.fixed)
+    if bounded and not (result.violations or result.on_bounds):
+        yield Finding("note", "Every parameter is within its bounds.")
 
 
 def _bodies(result: Result) -> Iterator[Finding]:
@@ -126,14 +116,12 @@ def _bodies(result: Result) -> Iterator[Finding]:
     name = max(changes, key=lambda n: abs(changes[n]), default="")
     # Of many base parameters, the largest of differences by chance is up to four standard errors.
     if name and abs(changes[name]) > 4.0:
-        far = number(abs(changes[name]), 2)
-        yield Finding(
-            "care",
+        claim = (
             "No possible bodies (of positive mass, with inertias that satisfy the triangle inequality) have these base "
-            f"parameters, the nearest of which differ by {far} standard errors of {name}; an exported description has "
-            "these",
-            "add the term that the model lacks, or record a longer log",
+            f"parameters, the nearest of which differ by {number(abs(changes[name]), 2)} standard errors of {name}; an "
+            "exported description has these"
         )
+        yield Finding("care", claim, "add the term that the model lacks, or record a longer log")
 
 
 def _known(result: Result) -> Iterator[Finding]:
@@ -145,28 +133,22 @@ def _known(result: Result) -> Iterator[Finding]:
         mean, std = result.priors.get(parameter_of(name, result.model.parameters), (np.nan, np.nan))
         away = abs(x - mean) / std
         if away > CLEAR:
-            text = (
-                f"{_these(result.logs)} {'contradict' if len(result.logs) > 1 else 'contradicts'} the prior of {name}"
-            )
+            logs = "These logs contradict" if len(result.logs) > 1 else "This log contradicts"
             far = f"{number(x)} lies {number(away, 2)} prior standard deviations from its mean {number(mean)}"
-            yield Finding(
-                "care", f"{text[0].upper()}{text[1:]}, since the estimate {far}", f"check the prior of {name}"
-            )
+            claim = f"{logs} the prior of {name}, since the estimate {far}"
+            yield Finding("care", claim, f"check the prior of {name}")
         elif np.isfinite(away):
             yield Finding("note", f"The estimate of {name} uses the prior {number(mean)} ± {number(std, 2)}.")
 
 
 def bounds_text(parameter: Parameter) -> str:
     """Bounds as text: ``> 0``, ``≥ 0``, ``0 to 2``; empty without bounds."""
-    if parameter.positive and parameter.lower <= 0.0:
-        return "> 0" if np.isinf(parameter.upper) else f"> 0, ≤ {number(parameter.upper)}"
-    if np.isinf(parameter.lower) and np.isinf(parameter.upper):
-        return ""
-    if np.isinf(parameter.upper):
-        return f"≥ {number(parameter.lower)}"
-    if np.isinf(parameter.lower):
-        return f"≤ {number(parameter.upper)}"
-    return f"{number(parameter.lower)} to {number(parameter.upper)}"
+    positive = parameter.positive and parameter.lower <= 0.0
+    lower = "> 0" if positive else "" if np.isinf(parameter.lower) else f"≥ {number(parameter.lower)}"
+    upper = "" if np.isinf(parameter.upper) else f"≤ {number(parameter.upper)}"
+    if lower and upper and not positive:
+        return f"{number(parameter.lower)} to {number(parameter.upper)}"
+    return ", ".join(filter(None, (lower, upper)))
 
 
 # ---------------------------------------------------------------------- simulation and inliers
@@ -176,12 +158,12 @@ def _remedy(result: Result, level: Level = "care") -> str:
     """Action for an answer that is off throughout, by the causes that were tested."""
     if result.suggestions:
         return _added(result.suggestions[0])
+    compare = "compare the terms and constants of the model with the machine"
     if result.estimate.n_columns_tested:
         tested = f"{result.estimate.n_columns_tested} other signs and units of columns explain the log no better"
-        return f"compare the terms and constants of the model with the machine ({tested})"
-    if level == "bad":
-        return "check the signs and units of the log, which could not be tested, and the terms of the model"
-    return "compare the terms and constants of the model with the machine"
+        return f"{compare} ({tested})"
+    checked = "check the signs and units of the log, which could not be tested, and the terms of the model"
+    return checked if level == "bad" else compare
 
 
 def _added(suggestion: Suggestion) -> str:
@@ -226,19 +208,17 @@ def _inliers(result: Result) -> Iterator[Finding]:
             "start add up, and grow where the machine is unstable.",
         )
         return
-    if fraction < _HALF:
+    if fraction < 0.5:
         claim = f"{text} the simulation, which is less than half of the log"
         yield Finding("care", claim, f"identify with --method lo-diransac, or {_remedy(result, 'bad')}")
         return
-    if fraction >= 0.7:
-        yield Finding("good", f"{text} the simulation.")
-    else:
-        yield Finding("care", f"{text} the simulation", "identify with --method lo-diransac")
+    yield Finding.of(
+        "good" if fraction >= 0.7 else "care", f"{text} the simulation", "identify with --method lo-diransac"
+    )
     for one, found in predicted:
         begin, end, lowest = found.weakest_window
-        if lowest < _HALF * fraction:
-            where = f" of {one.source}" if len(logs) > 1 else ""
-            between = f"Between {number(begin)} and {number(end)} s{where}"
+        if lowest < 0.5 * fraction:
+            between = f"Between {number(begin)} and {number(end)} s{f' of {one.source}' if len(logs) > 1 else ''}"
             claim = f"{between} only {percent(lowest)} of the rows agree with the simulation"
             yield Finding("care", claim, f"look at it, or leave it out: --leave-out={begin:.4g}:{end:.4g}")
 
@@ -253,45 +233,44 @@ def _diagnosis(result: Result) -> Iterator[Finding]:
         return
     name = max(found.outlier_fraction, key=lambda n: found.outlier_fraction[n])
     most = found.outlier_fraction[name]
-    if most > 0.01:
-        text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
-        # Beyond two thirds the estimate of lo-diransac is arbitrary.
-        if most <= 2.0 / 3.0:
-            if most <= _HALF:
-                yield Finding("note", f"{text}; the estimate down-weights them.")
-            else:
-                yield Finding("care", f"{text}, which the estimate down-weights", f"look at {name}, or leave it out")
-        else:
-            yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result, 'bad')}")
+    text = f"Up to {percent(most)} of the samples of a signal ({name}) are outliers"
+    if most > 2.0 / 3.0:  # the estimate of lo-diransac is arbitrary
+        yield Finding("bad", text, f"leave {name} out of the log, or {_remedy(result, 'bad')}")
+    elif most > 0.5:
+        yield Finding("care", f"{text}, which the estimate down-weights", f"look at {name}, or leave it out")
+    elif most > 0.01:
+        yield Finding("note", f"{text}; the estimate down-weights them.")
     yield from _departures(result.logs, found)
     yield from _unexplained(result)
     if found.input_delay_significant:
-        sense, lag = "later" if found.input_delay > 0.0 else "earlier", result.estimate.resolution.timing.lag
-        time = duration(abs(found.input_delay))
-        late, what = f"Inputs act {time} {sense} than recorded", "delay"
-        if lag:
-            late, what = f"Inputs act after a first-order lag of the actuators of {time} (time constant)", "lag"
-        yield Finding("care", f"{late}, which the estimate includes", f"give other simulations this {what}, too")
-    yield from _unidentifiable(result, found)
+        late = (
+            f"act {duration(abs(found.input_delay))} {'later' if found.input_delay > 0.0 else 'earlier'} than recorded"
+        )
+        what = "lag" if result.estimate.resolution.timing.lag else "delay"
+        if what == "lag":
+            late = f"act after a first-order lag of the actuators of {duration(abs(found.input_delay))} (time constant)"
+        yield Finding("care", f"Inputs {late}, which the estimate includes", f"give other simulations this {what}, too")
+    if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
+        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result, "bad"))
+    for sentence in found.unidentifiable_sentences():
+        claim, _, action = sentence.rpartition("; ")
+        yield Finding("care", claim or sentence, action)
 
 
 def _departures(logs: Sequence[LogSummary], found: Diagnosis) -> Iterator[Finding]:
     """Stretches in which the model does not hold."""
     for i, one in enumerate(logs):
-        known = {} if one.prediction is None else one.prediction.unexplained
-        stretches = departures(found, i, known)
+        stretches = departures(found, i, {} if one.prediction is None else one.prediction.unexplained)
         if stretches:
             listed = ", ".join(f"{number(x.start, 3)} to {number(x.stop, 3)} s" for x in stretches[:_LISTED])
             more = f" and {len(stretches) - _LISTED} more" if len(stretches) > _LISTED else ""
-            option = ",".join(f"{x.start:.4g}:{x.stop:.4g}" for x in stretches)
-            ratio = number(max(x.ratio for x in stretches), 2)
-            yield Finding(
-                "care",
+            claim = (
                 f"The model does not hold from {listed}{more}{_worst_of(one, logs)}: forces that it lacks are up to "
-                f"{ratio} times as large there as elsewhere, as on the ground, in the hand, at a stop or at a limit of "
-                "the inputs",
-                f"leave it out, unless a term explains it: --leave-out={option}",
+                f"{number(max(x.ratio for x in stretches), 2)} times as large there as elsewhere, as on the ground, in "
+                "the hand, at a stop or at a limit of the inputs"
             )
+            option = ",".join(f"{x.start:.4g}:{x.stop:.4g}" for x in stretches)
+            yield Finding("care", claim, f"leave it out, unless a term explains it: --leave-out={option}")
 
 
 def _unexplained(result: Result) -> Iterator[Finding]:
@@ -306,16 +285,8 @@ def _unexplained(result: Result) -> Iterator[Finding]:
     text = f"The model leaves {percent(left)} of {name} unexplained (RMS){others}{_worst_of(one, result.logs)}"
     # Forces that predictions do not show, as those of vibrations, need care at worst.
     shown = result.predictions is None or max(result.predictions.judged.relative_error.values(), default=np.inf) > FAR
-    level = graded(left, _LITTLE, _HALF if shown else np.inf)
-    yield Finding("good", f"{text}.") if level == "good" else Finding(level, text, _remedy(result, level))
-
-
-def _unidentifiable(result: Result, found: Diagnosis) -> Iterator[Finding]:
-    if len(result.unidentifiable) == len(result.parameters) - len(result.fixed):
-        yield Finding("bad", f"No parameter is identifiable from {_these(result.logs)}", _remedy(result, "bad"))
-    for sentence in found.unidentifiable_sentences():
-        claim, _, action = sentence.rpartition("; ")
-        yield Finding("care", claim or sentence, action)
+    level = graded(left, 0.05, 0.5 if shown else np.inf)
+    yield Finding.of(level, text, _remedy(result, level))
 
 
 def _these(logs: Sequence[LogSummary]) -> str:
@@ -324,43 +295,40 @@ def _these(logs: Sequence[LogSummary]) -> str:
 
 def _uncertainty(result: Result) -> Iterator[Finding]:
     """Widths of the confidence intervals."""
-    widths: dict[str, float] = {}
+    parameters = result.model.parameters
     intervals = {n: x for n, x in result.intervals().items() if n not in result.fixed}
     unknown = [name for name, (low, high) in intervals.items() if not np.isfinite(high - low)]
-    stuck = {parameter_of(name, result.model.parameters) for name in result.on_bounds}
+    stuck = {parameter_of(name, parameters) for name in result.on_bounds}
     lost = [name for name in unknown if name not in stuck]
     if lost and not result.separates_forces:
         rows = plural(result.n_fitted, "fitted row")
         claim = f"The uncertainty of {', '.join(lost)} is unknown: {rows} are too few, or do not excite it"
         yield Finding("care", claim, "give a longer log")
-    zero: dict[bool, list[str]] = {True: [], False: []}
-    for name, (low, high) in intervals.items():
-        # The mean of a per-log parameter is of no machine: the table of the logs has its values.
-        if name in unknown or (result.model.parameters[name].per_log and not result.layout.is_shared):
-            continue
-        if low <= 0.0 <= high:
-            zero[bool(result.model.parameters[name].admits(0.0))].append(name)
-        else:
-            widths[name] = 0.5 * (high - low) / abs(result.parameters[name])
-    for possible, names in zero.items():
+    # The mean of a per-log parameter is of no machine: the table of the logs has its values.
+    varying = [n for n, x in parameters.items() if x.per_log and not result.layout.is_shared]
+    known = {n: x for n, x in intervals.items() if n not in (*unknown, *varying)}
+    zero = [n for n, (low, high) in known.items() if low <= 0.0 <= high]
+    for possible in (True, False):
+        names = [n for n in zero if parameters[n].admits(0.0) == possible]
+        verb = "does" if len(names) == 1 else "do"
+        claim = f"{', '.join(names)} {verb} not differ significantly from zero: 0 is in the 95 % interval"
         if names:
-            verb = "does" if len(names) == 1 else "do"
-            claim = f"{', '.join(names)} {verb} not differ significantly from zero: 0 is in the 95 % interval"
             yield Finding("note", f"{claim}.") if possible else Finding("care", claim, _more_of(result, names))
-    wide = sorted((n for n, x in widths.items() if x > 0.5), key=lambda n: -widths[n])
+    widths = {n: 0.5 * (x[1] - x[0]) / abs(result.parameters[n]) for n, x in known.items() if n not in zero}
+    ordered = sorted(widths, key=lambda n: -widths[n])
+    wide = [n for n in ordered if widths[n] > 0.5]
     if wide:
         listed = ", ".join(f"{n} by ±{percent(widths[n])}" for n in wide)
         yield Finding("care", f"Uncertain by more than half (95 % interval): {listed}", _more_of(result, wide))
-    if widths and not wide:
-        name = max(widths, key=lambda n: widths[n])
-        what = f"{name} is" if len(widths) == 1 else f"The least certain parameter is {name},"
-        yield Finding("good", f"{what} uncertain by ±{percent(widths[name])} (95 % interval).")
+    elif widths:
+        what = f"{ordered[0]} is" if len(widths) == 1 else f"The least certain parameter is {ordered[0]},"
+        yield Finding("good", f"{what} uncertain by ±{percent(widths[ordered[0]])} (95 % interval).")
 
 
 def _more_of(result: Result, names: Sequence[str]) -> str:
     """Action for uncertain parameters: a motion that moves their terms more, or a value from elsewhere."""
     one = parameter_of(names[0], result.model.parameters)
-    if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > _HALF for x in result.logs):
+    if any(x.prediction and max(x.prediction.unexplained.values(), default=0.0) > 0.5 for x in result.logs):
         return _remedy(result)
     return f"record a log in which the term of {one} is larger, or fix it: --fix {one}=VALUE"
 
@@ -395,12 +363,10 @@ def _bandwidth(result: Result) -> Iterator[Finding]:
     name = max(changes, key=lambda n: max(map(abs, changes[n])))
     change = max(map(abs, changes[name]))
     level = graded(change, 0.05, 0.2)
-    if level == "good":
-        text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})."
-        yield Finding("good", text)
-    else:
-        claim = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
-        yield Finding(level, claim, _OTHER_BANDWIDTH)
+    text = f"At half or twice the filter's bandwidth no parameter changes by more than {percent(change)} ({name})"
+    if level != "good":
+        text = f"{name} changes by {percent(change)} at half or twice the filter's bandwidth"
+    yield Finding.of(level, text, _OTHER_BANDWIDTH)
 
 
 # ---------------------------------------------------------------------- search and logs
@@ -411,12 +377,9 @@ def noticed_disagreements(result: Result) -> list[tuple[Disagreement, Level]]:
     intervals = result.structural_intervals() if result.has_structure else result.intervals()
     found = []
     for one in result.estimate.disagreements:
-        moved, width = 0.0, np.inf
-        if one.name in intervals:
-            low, high = intervals[one.name]
-            moved, width = abs(one.parameters[one.name] - result.parameters[one.name]), high - low
-        level = level_of_disagreement(one, moved, width)
-        if level is not None:
+        low, high = intervals.get(one.name, (0.0, np.inf))
+        moved = abs(one.parameters[one.name] - result.parameters[one.name]) if one.name in intervals else 0.0
+        if level := level_of_disagreement(one, moved, high - low):
             found.append((one, level))
     return found
 

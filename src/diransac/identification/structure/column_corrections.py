@@ -1,10 +1,10 @@
 """Corrections of columns, tested by the equations: another unit or sign, exchanged columns, inputs that act later.
 
-Each is a hypothesis.  It is said where equations that are fitted to one half of the rows with the correction predict
-the other half much better than without it, and are explained by it, too, not only better; and where no other parameter
-and no constant of the model takes the unit up.  A scale inside a nonlinear term does: multiplied by a small factor, a
-column makes ``tanh(v / s)`` linear.  So a factor must be one that the log determines, and the model with the factor
-inside of its nonlinear functions alone, which leaves the column in its unit, must be worse.
+Each is a hypothesis.  It is accepted where equations that are fitted to one half of the rows with the correction
+predict the other half much better than without it, explain most of it, and do so better than every rival: another
+correction, and the model with the factor inside of its nonlinear functions alone; half or twice the factor must fit
+worse by a fifth.  A scale inside a nonlinear term takes a unit up: multiplied by a small factor, a column makes
+``tanh(v / s)`` linear.
 
 Parameters are those within their bounds.  Without bounds, a reversed sign changes no residual where parameters take it
 up, with signs that are impossible.
@@ -12,7 +12,7 @@ up, with signs that are impossible.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -23,6 +23,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.units import conversion, one_turn
+from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import (
     EXACT,
     MotionRows,
@@ -34,35 +35,22 @@ from diransac.identification.regression.rows import (
 from diransac.model.expressions import applied, steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from diransac.data.dataset import ParameterLayout
-    from diransac.identification.regression.rows import Solution
     from diransac.model import Model
 
-    Solver = Callable[[Model, ParameterLayout, Sequence[MotionRows]], Solution | None]
-
-# Units in which columns are recorded by mistake; those of another dimension than the model's are none.
-_UNITS: tuple[str, ...] = ("rad", "deg", "rad/s", "deg/s", "rpm", "deg/s^2", "rad/s^2", "m", "mm", "cm", "m/s")
-_UNITS += ("mm/s", "km/h", "m/s^2", "g", "mm/s^2", "N", "mN", "kN", "N m", "mN m", "Pa", "kPa", "bar", "V", "mV")
-_UNITS += ("A", "mA", "K", "s", "ms")
-_OFFSETS = {"K": ("degC", 1.0, 273.15)}
+_UNITS = (
+    "rad, deg, rad/s, deg/s, rpm, deg/s^2, rad/s^2, m, mm, cm, m/s, mm/s, km/h, m/s^2, g, mm/s^2, N, mN, kN, N m, "
+    "mN m, Pa, kPa, bar, V, mV, A, mA, K, s, ms"
+)
+"""Units in which columns are recorded by mistake; those of another dimension than the model's are none."""
 SAME_FACTOR = 0.1
 """Largest logarithm of a ratio of factors that are those of one unit."""
-# Rows of each log that are fitted, and as many that are predicted; blocks of them that alternate.
-_ROWS, _BLOCKS = 300, 20
-# Delays of inputs that are tried first, rows; then their neighbours, if the residual is below this share.
-_DELAYS, _USEFUL = (1, 2, 4, 8, 16, 32), 0.9
-# Residual over that without the correction from which on it explains a log much better, and that of other equations or
-# of the next best correction over it.
-_MUCH_BETTER, _DISTINCT = 0.5, 1.5
-# Residual over the size of the known terms at which equations are explained; at which there is nothing to explain.
-_EXPLAINED, _NOTHING_LEFT = 0.3, 0.05
-# A factor that the log determines: residual over that of the unit, at least, with this factor off either way.
-_OFF, _WORSE = 2.0, 1.2
-# Operations that a factor passes, and those of angles that have no scale.
-_LINEAR = ("add", "sub", "neg", "mul", "twice", "sq", "fabs", "sign", "not")
-_OF_ANGLES = ("sin", "cos", "tan")
+MUCH_BETTER = 0.5
+"""Residual with a correction over that without it, up to which it explains a log much better."""
+DISTINCT = 1.5
+"""Residual of a rival over that of a correction, from which on it is refuted."""
+EXPLAINED = 0.3
+"""Residual over the size of the known terms up to which equations are explained."""
 
 
 @dataclass(frozen=True)
@@ -91,21 +79,17 @@ class Correction:
     delay: int = 0
 
     def of_rows(self, model: Model, rows: MotionRows, some: IntArray | slice = slice(None)) -> MotionRows:
-        """Some rows of a motion, corrected."""
-        groups = (tuple(model.coordinates), model.rate_names, model.rate_names, tuple(model.inputs))
-        found = list[FloatArray]()
-        for k, (names, x) in enumerate(zip(groups, (rows.q, rows.v, rows.a, rows.u), strict=True)):
-            own = np.array([n in self.names for n in names], bool)
-            moved = own & np.array([k in (0, 3) or (k == 1 and n in model.first_order) for n in names], bool)
-            part = x[some] * np.where(own, self.factor, 1.0) + self.offset * moved
-            if self.exchanged and own.any():
-                part[:, own] = part[:, own][:, ::-1]
-            found.append(part)
-        if self.delay:
-            own = np.array([n in self.names for n in model.inputs], bool)
-            earlier = np.clip(np.arange(len(rows.u))[some] - self.delay, 0, len(rows.u) - 1)
-            found[3][:, own] = rows.u[earlier][:, own]
-        q, v, a, u = found
+        """Some rows of a motion, corrected, with the derivatives of the signals."""
+        names, chains = (*model.state, *model.accelerations, *model.inputs), {x[0]: x for x in model.chains}
+        recorded = dict(zip(names, np.hstack([rows.q, rows.v, rows.a, rows.u]).T, strict=True))
+        found = {name: x[some] for name, x in recorded.items()}
+        for name, other in zip(self.names, reversed(self.names) if self.exchanged else self.names, strict=True):
+            for target, source in zip(chains.get(name, (name,)), chains.get(other, (other,)), strict=True):
+                x = recorded[source]
+                late = np.r_[np.repeat(x[:1], self.delay), x][: len(x)] if self.delay else x
+                found[target] = late[some] * self.factor + self.offset * (target == name)
+        sizes = np.cumsum([rows.q.shape[1], rows.v.shape[1], rows.a.shape[1]])
+        q, v, a, u = np.split(np.array(list(found.values())).T, sizes, axis=1)
         return MotionRows(q, v, a, u, rows.y[some])
 
 
@@ -120,7 +104,7 @@ class CorrectedEquations:
         Of the rows that were fitted.
     residuals : (n_eq,) array
         Median size of the residuals of the other rows with parameters within their bounds, over that of the known
-        terms.
+        terms; infinite where the equations overflow.
     outside : list of str
         Parameters that are clearly outside of their bounds.
     """
@@ -140,16 +124,14 @@ class CorrectedEquations:
 
         A unit that makes the terms of an equation vanish silences what contradicts the others, and explains nothing.
         """
-        better = other.residuals < _MUCH_BETTER * self.residuals
-        return np.asarray(better & (other.residuals < _DISTINCT * self.residuals).all())
+        better = other.residuals < MUCH_BETTER * self.residuals
+        return np.asarray(better & (other.residuals < DISTINCT * self.residuals).all())
 
     def rivals(self, other: CorrectedEquations) -> bool:
         """True if another correction, neither a part of this one nor the reverse, explains a log nearly as well."""
-        a, b = self.correction, other.correction
-        own, others = set(a.names), set(b.names)
-        alike = (a.factor, a.offset, a.exchanged) == (b.factor, b.offset, b.exchanged)
-        nested = alike and (own <= others or others <= own)
-        return not nested and other.residual < _DISTINCT * self.residual
+        a, b = (set(x.correction.names) for x in (self, other))
+        alike = replace(self.correction, names=()) == replace(other.correction, names=())
+        return not (alike and (a <= b or b <= a)) and other.residual < DISTINCT * self.residual
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +143,6 @@ class CorrectionTests:
     model : Model
     layout : ParameterLayout
     rows : sequence of MotionRows
-    nonlinear : callable
-        Solution of a model that is not affine in its parameters, as `solved`.
     delays : bool, optional
         Whether delays of inputs are tested, which an estimate may include.
     """
@@ -170,31 +150,31 @@ class CorrectionTests:
     model: Model
     layout: ParameterLayout
     rows: Sequence[MotionRows]
-    nonlinear: Solver
     delays: bool = True
 
     @cached_property
-    def _some(self) -> list[tuple[IntArray, BoolArray]]:
-        """Rows of each log that take part, and a mask of those that are predicted."""
-        found = []
-        for one in self.rows:
-            some = np.arange(0, len(one.q), max(1, len(one.q) // (2 * _ROWS)))
-            found.append((some, np.arange(len(some)) * _BLOCKS // max(1, len(some)) % 2 == 1))
-        return found
-
-    @cached_property
-    def without(self) -> CorrectedEquations | None:
+    def without(self) -> CorrectedEquations:
         """The equations as the log was recorded."""
         return self.of(Correction())
 
-    def of(self, correction: Correction, model: Model | None = None) -> CorrectedEquations | None:
-        """The equations with a correction, or those of another model of the same signals; None if they overflow."""
+    @property
+    def need_no_correction(self) -> bool:
+        """True if the equations hold as recorded, with all parameters within their bounds, or overflow."""
+        largest = self.without.residuals.max()
+        return not np.isfinite(largest) or (not self.without.outside and bool(largest < 0.05))
+
+    def of(self, correction: Correction, model: Model | None = None) -> CorrectedEquations:
+        """The equations with a correction, or those of another model of the same signals."""
         model = model or self.model
-        parts = [correction.of_rows(model, one, some) for one, (some, _) in zip(self.rows, self._some, strict=True)]
-        held = [mask for _, mask in self._some]
-        found = self._nonlinear(model, parts, held) if model.nonlinear_parameters else self._affine(model, parts, held)
+        # 600 rows of each log are enough.
+        some = [np.arange(0, len(x.q), max(1, len(x.q) // 600)) for x in self.rows]
+        parts = [correction.of_rows(model, *pair) for pair in zip(self.rows, some, strict=True)]
+        # Blocks of rows that alternate: neighbours in time have correlated errors.
+        held = [np.arange(len(x)) * 20 // max(1, len(x)) % 2 == 1 for x in some]
+        predict = self._nonlinear if model.nonlinear_parameters else self._affine
+        found = predict(model, parts, held)
         if found is None:
-            return None
+            return CorrectedEquations(correction, np.full(len(self.layout), np.nan), np.array([np.inf]), [])
         parameters, errors, residuals = found
         outside = outside_bounds(self.layout, parameters, errors)
         return CorrectedEquations(correction, parameters, np.maximum(residuals, EXACT), outside)
@@ -205,17 +185,17 @@ class CorrectionTests:
         """Parameters, standard errors and residuals of ``W p = b``; None without a known term."""
         rows, finite = scaled_equations(model, self.layout, parts)
         predicted = np.concatenate(held)[finite]
-        found = robust_fit(rows[~predicted]) if predicted.any() and not predicted.all() else None
-        if found is None or not rows[:, :, -1].any():
+        fit = robust_fit(rows[~predicted]) if predicted.any() and not predicted.all() else None
+        if fit is None or not rows[:, :, -1].any():
             return None
-        possible = self._within_bounds(rows[~predicted], found.parameters)
+        possible = self._within_bounds(rows[~predicted], fit.parameters)
         W, b = rows[predicted, :, :-1], rows[predicted, :, -1]
         residuals = np.median(np.abs(W @ possible - b), axis=0)
         # Zero solves an equation without a known term: its residual is that over its terms.
         whole = np.median(np.abs(W) @ np.abs(possible), axis=0)
         of_terms = np.where(whole > EXACT, residuals / np.maximum(whole, EXACT), 1.0)
         residuals = np.where(b.any(axis=0), residuals, of_terms)
-        return found.parameters, standard_errors(rows[~predicted], found), residuals
+        return fit.parameters, standard_errors(rows[~predicted], fit), residuals
 
     def _within_bounds(self, rows: FloatArray, p: FloatArray) -> FloatArray:
         """Parameters ``(n,)`` within bounds: those that leave them are held there, and the others fitted again."""
@@ -225,110 +205,81 @@ class CorrectionTests:
             held |= (p < lower) | (p > upper)
             p = np.clip(p, lower, upper)
             known = rows[:, :, -1] - rows[:, :, :-1][:, :, held] @ p[held]
-            if held.all() or (found := robust_fit(np.dstack([rows[:, :, :-1][:, :, ~held], known]))) is None:
+            if held.all() or (fit := robust_fit(np.dstack([rows[:, :, :-1][:, :, ~held], known]))) is None:
                 return p
-            p[~held] = found.parameters
+            p[~held] = fit.parameters
         return p
 
     def _nonlinear(
         self, model: Model, parts: Sequence[MotionRows], held: Sequence[BoolArray]
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Parameters, no errors, and residuals of accelerations over their sizes."""
-        halves = [
-            [MotionRows(*(x[mask == which] for x in (one.q, one.v, one.a, one.u, one.y))) for one, mask in both]
-            for both in [list(zip(parts, held, strict=True))]
+        pairs = list(zip(parts, held, strict=True))
+        fitted, predicted = (
+            [Correction().of_rows(model, x, np.flatnonzero(mask == which)) for x, mask in pairs]
             for which in (False, True)
-        ]
-        found = self.nonlinear(model, self.layout, halves[0])
-        if found is None:
+        )
+        solution = solved_nonlinear(model, self.layout, fitted)
+        if solution is None:
             return None
-        errors, sizes = [], []
-        for i, one in enumerate(halves[1]):
-            p = np.repeat(self.layout.of_log(found.parameters, i)[:, None], len(one.q), axis=1)
-            a = np.array(model.dynamics(np.hstack([one.q, one.v]).T, one.u.T, p)[1]).T
-            errors.append(np.abs(one.a - a))
-            sizes.append(np.abs(one.a))
-        size = np.sqrt(np.square(np.concatenate(sizes)).mean(axis=0)) + EXACT**2
+        errors = []
+        for i, one in enumerate(predicted):
+            p = np.repeat(self.layout.of_log(solution.parameters, i)[:, None], len(one.q), axis=1)
+            errors.append(np.abs(one.a - np.array(model.dynamics(np.hstack([one.q, one.v]).T, one.u.T, p)[1]).T))
+        size = np.sqrt(np.square(np.concatenate([x.a for x in predicted])).mean(axis=0)) + EXACT**2
         residuals = np.median(np.concatenate(errors), axis=0) / size
-        return found.parameters, np.zeros_like(found.parameters), np.where(np.isfinite(residuals), residuals, np.inf)
+        return solution.parameters, solution.errors, np.where(np.isfinite(residuals), residuals, np.inf)
 
 
-# ---------------------------------------------------------------------- what explains a log
-
-
-def nothing_to_explain(tests: CorrectionTests) -> bool:
-    """True if the equations hold as recorded, with all parameters within their bounds."""
-    without = tests.without
-    return without is not None and not without.outside and bool((without.residuals < _NOTHING_LEFT).all())
+# ---------------------------------------------------------------------- acceptance
 
 
 def explained(tests: CorrectionTests) -> tuple[list[CorrectedEquations], int]:
-    """The correction with which the equations hold much better, if it is proved; none where several do.
+    """The correction with which the equations hold much better, if it is proved, and its alternatives.
 
     Several signs are reversed one after another, as long as more equations hold.  Two signs of one equation, those of a
     force and of a motion, are alternatives.  Delays are tested where nothing else explains the log.
 
-    Parameters
-    ----------
-    tests : CorrectionTests
-
     Returns
     -------
-    found : list of CorrectedEquations
-        The correction, and its alternatives.
+    accepted : list of CorrectedEquations
     n_tested : int
         Number of corrections that were tested.
     """
-    without = tests.without
-    assert without is not None
-    tested = [x for one in corrections(tests.model) if (x := tests.of(one)) is not None]
-    found = _best(tests, without, [*tested, *_several_signs(tests, without)])
-    if not found and tests.delays:
-        found = _best(tests, without, list(_delays(tests, without)))
-    return found, len(tested)
+    tested = [tests.of(x) for x in corrections(tests.model)]
+    accepted = _accepted(tests, [*tested, *_several_signs(tests)])
+    if not accepted and tests.delays:
+        accepted = _accepted(tests, list(_delays(tests)))
+    return accepted, len(tested)
 
 
-def _best(
-    tests: CorrectionTests, without: CorrectedEquations, tested: Sequence[CorrectedEquations]
-) -> list[CorrectedEquations]:
-    """The best of some corrections, and its alternatives, if it is proved."""
-    better = [x for x in tested if not x.outside and without.improved_by(x).any()]
+def _accepted(tests: CorrectionTests, tested: Sequence[CorrectedEquations]) -> list[CorrectedEquations]:
+    """The best of some corrections, and its alternatives, if no rival explains the log nearly as well."""
+    better = [x for x in tested if not x.outside and tests.without.improved_by(x).any()]
     better.sort(key=lambda x: (x.residual, len(x.correction.names)))
     rivals = [x for x in better[1:] if better[0].rivals(x)]
-    if any(x.correction.factor > 0.0 for x in rivals) or not better or not _is_proved(tests, without, better[0]):
+    if any(x.correction.factor > 0.0 for x in rivals) or not better or not _is_proved(tests, better[0]):
         return []
     return sorted([better[0], *rivals], key=lambda x: x.correction.names[0] not in tests.model.inputs)
 
 
-def _several_signs(tests: CorrectionTests, best: CorrectedEquations) -> Iterator[CorrectedEquations]:
-    """Signs of more and more inputs, each that with which fewer parameters are outside of their bounds."""
-    for _ in range(len(tests.model.inputs)):
-        names = best.correction.names
-        more = [tests.of(Correction((*names, n), factor=-1.0)) for n in tests.model.inputs if n not in names]
-        fewer = [x for x in more if x is not None and len(x.outside) < len(best.outside)]
-        if not fewer:
-            return
-        best = min(fewer, key=lambda x: (len(x.outside), x.residual))
-        yield best
-
-
-def _is_proved(tests: CorrectionTests, without: CorrectedEquations, best: CorrectedEquations) -> bool:
+def _is_proved(tests: CorrectionTests, best: CorrectedEquations) -> bool:
     """True if the equations are explained, the log determines the factor, and no constant of the model takes it up.
 
     Bounds determine it, too, where parameters are clearly outside of them as recorded.
     """
-    one, improved = best.correction, without.improved_by(best)
-    if (best.residuals[improved] > _EXPLAINED).any():
+    one, improved = best.correction, tests.without.improved_by(best)
+    if (best.residuals[improved] > EXPLAINED).any():
         return False
-    if not one.unit or without.outside:
+    if not one.unit or tests.without.outside:
         return True
-    for off in (_OFF, 1.0 / _OFF):
-        factor = one.factor * off if not one.offset else one.factor
-        other = tests.of(replace(one, factor=factor, offset=one.offset * off))
-        if other is not None and other.residual < _WORSE * best.residual:
-            return False
+    others = (
+        replace(one, offset=one.offset * x) if one.offset else replace(one, factor=one.factor * x) for x in (0.5, 2)
+    )
+    if any(tests.of(x).residual < 1.2 * best.residual for x in others):
+        return False
     rival = tests.of(Correction(), with_factor_inside(tests.model, one))
-    return rival is None or bool((rival.improved_by(best) & improved).any())
+    return bool((rival.improved_by(best) & improved).any())
 
 
 # ---------------------------------------------------------------------- the hypotheses
@@ -336,52 +287,68 @@ def _is_proved(tests: CorrectionTests, without: CorrectedEquations, best: Correc
 
 def other_units(wanted: str) -> list[tuple[str, float]]:
     """Other units of a dimension, with the factors that convert from them."""
-    found: dict[float, str] = {}
-    for unit in _UNITS:
+    found = dict[float, tuple[str, float]]()
+    for unit in _UNITS.split(", "):
         factor = conversion(unit, wanted)
         if factor is not None and abs(np.log(factor)) > SAME_FACTOR:
-            found.setdefault(round(factor, 12), unit)
-    return [(unit, conversion(unit, wanted) or 1.0) for unit in found.values()]
+            found.setdefault(round(factor, 12), (unit, factor))
+    return list(found.values())
+
+
+def conversions(kind: Mapping[str, str]) -> Iterator[Correction]:
+    """Units and signs of signals: of single ones, of several, and of all of a unit."""
+    for unit in dict.fromkeys(kind.values()):
+        names = tuple(n for n, x in kind.items() if x == unit)
+        # All subsets of few signals of a unit are tested.
+        sizes = range(1, len(names) + 1) if len(names) <= 3 else (1, len(names))
+        for group in (group for size in sizes for group in combinations(names, size)):
+            yield from (Correction(group, other, factor) for other, factor in other_units(unit))
+            yield Correction(group, factor=-1.0)
+            if unit == "K":
+                yield Correction(group, "degC", offset=273.15)
 
 
 def corrections(model: Model) -> Iterator[Correction]:
-    """Units, signs and exchanges of signals: of single ones, of several, and of all of a kind and unit.
+    """Units, signs and exchanges of signals of a kind, and units of all.
 
     A thermometer in another unit than all others is rare: states and inputs have their offsets together, too.
     """
     moving = model.coordinates if model.kinematics is None else model.velocities_of_motion
     for kind in (model.inputs, moving, model.first_order):
-        for unit in dict.fromkeys(kind.values()):
-            names = tuple(n for n, x in kind.items() if x == unit)
-            # All subsets of few signals of a unit are tested.
-            sizes = range(1, len(names) + 1) if len(names) <= 3 else (1, len(names))
-            groups = [group for size in sizes for group in combinations(names, size)]
-            yield from (Correction(g, other, factor) for g in groups for other, factor in other_units(unit))
-            yield from (Correction(g, factor=-1.0) for g in groups)
-            yield from (Correction(g, *_OFFSETS[unit]) for g in groups if unit in _OFFSETS)
-            yield from (Correction(pair, exchanged=True) for pair in combinations(names, 2))
+        yield from conversions(kind)
+        yield from (Correction(x, exchanged=True) for x in combinations(kind, 2) if kind[x[0]] == kind[x[1]])
     if len(set(model.inputs.values())) > 1:
         yield Correction(tuple(model.inputs), factor=-1.0)
-    for unit, other in _OFFSETS.items():
-        every = tuple(n for n, x in (model.first_order | model.inputs).items() if x == unit)
-        if len(every) > 1:
-            yield Correction(every, *other)
+    kelvin = tuple(n for n, unit in (model.first_order | model.inputs).items() if unit == "K")
+    if len(kelvin) > 1:
+        yield Correction(kelvin, "degC", offset=273.15)
 
 
-def _delays(tests: CorrectionTests, without: CorrectedEquations) -> Iterator[CorrectedEquations]:
-    """The best delay of all inputs, and of each, where it is of any use."""
+def _several_signs(tests: CorrectionTests) -> Iterator[CorrectedEquations]:
+    """Signs of more and more inputs, each that with which fewer parameters are outside of their bounds."""
+    best = tests.without
+    while best.outside:
+        names = best.correction.names
+        more = [tests.of(Correction((*names, n), factor=-1.0)) for n in tests.model.inputs if n not in names]
+        fewer = [x for x in more if len(x.outside) < len(best.outside)]
+        if not fewer:
+            return
+        best = min(fewer, key=lambda x: (len(x.outside), x.residual))
+        yield best
+
+
+def _delays(tests: CorrectionTests) -> Iterator[CorrectedEquations]:
+    """The best delay of all inputs, and of each: powers of two, then, if it is of any use, those around the best."""
     inputs = tuple(tests.model.inputs)
-    for names in dict.fromkeys([inputs, *((n,) for n in inputs)]):
-        found = {k: tests.of(Correction(names, delay=k)) for k in _DELAYS} if names else {}
-        known = {k: x for k, x in found.items() if x is not None}
-        while known:
-            best = min(known, key=lambda k: known[k].residual)
-            near = [k for k in (best - 1, best + 1) if k > 0 and k not in found]
-            if not near or known[best].residual > _USEFUL * without.residual:
-                yield known[best]
-                break
-            found |= {k: tests.of(Correction(names, delay=k)) for k in near}
-            known = {k: x for k, x in found.items() if x is not None}
+    for names in dict.fromkeys([inputs, *((n,) for n in inputs)] if inputs else ()):
+        tried = [tests.of(Correction(names, delay=2**k)) for k in range(6)]
+        best = min(tried, key=lambda x: x.residual)
+        step = best.correction.delay // 2
+        while step and best.residual < 0.9 * tests.without.residual:
+            near = [tests.of(replace(best.correction, delay=best.correction.delay + x)) for x in (-step, step)]
+            best = min([best, *near], key=lambda x: x.residual)
+            step //= 2
+        yield best
 
 
 def with_factor_inside(model: Model, correction: Correction) -> Model:
@@ -389,34 +356,34 @@ def with_factor_inside(model: Model, correction: Correction) -> Model:
 
     Sines of angles have no such constant: an angle is its own unit.
     """
-    residual, groups = model.residual, (model.coordinates, model.rate_names, model.rate_names, model.inputs)
-    own = [[n in correction.names for n in names] for names in groups]
-    angles = all(one_turn(model.units[n]) is not None for n in correction.names if n in model.units)
-    plain = (*_LINEAR, *_OF_ANGLES) if angles else _LINEAR
-    rows = residual.sparsity_out(0).row()
+    residual, rows = model.residual, model.residual.sparsity_out(0).row()
+    own = [[n in correction.names for n in names] for names in model.argument_names[:4]]
+    passed = {"assign", "add", "sub", "neg", "mul", "twice", "sq", "fabs", "sign", "not"}
+    if all(one_turn(model.units[n]) is not None for n in correction.names if n in model.units):
+        passed |= {"sin", "cos", "tan"}
 
     def equations(*named: Sequence[ca.SX]) -> list[ca.SX]:
-        symbols = [list(x) for x in named]
-        values, results = list[tuple[ca.SX, ca.SX]](), [ca.SX(0)] * residual.numel_out(0)
+        symbols, results = [list(x) for x in named], [ca.SX(0)] * residual.numel_out(0)
+        values = list[tuple[ca.SX, ca.SX]]()  # without the factor, and with it
         for step in steps(residual):
             i, k = step.place
             outside, inside = ([values[j][which] for j in step.operands] for which in (0, 1))
             if step.operation == "output":
                 results[rows[k]] = outside[0]
-                value = outside[0], inside[0]
+                values.append((outside[0], inside[0]))
             elif step.operation == "input":
                 x = symbols[i][k]
-                value = x, x * correction.factor + correction.offset if i < len(own) and own[i][k] else x
+                values.append((x, x * correction.factor + correction.offset if i < len(own) and own[i][k] else x))
             elif step.operation == "const":
-                value = (ca.SX(step.constant),) * 2
-            elif step.operation == "assign":
-                value = outside[0], inside[0]
-            elif step.operation in plain:
-                value = applied(step.operation, *outside), applied(step.operation, *inside)
+                values.append((ca.SX(step.constant), ca.SX(step.constant)))
             else:
                 scaled = applied(step.operation, *inside)
-                value = applied("div", outside[0], inside[1]) if step.operation == "div" else scaled, scaled
-            values.append(value)
+                if step.operation in passed:
+                    values.append((applied(step.operation, *outside), scaled))
+                else:
+                    values.append(
+                        (applied("div", outside[0], inside[1]) if step.operation == "div" else scaled, scaled)
+                    )
         return results
 
     return model.with_equations(model.name, model.parameters, equations, {})

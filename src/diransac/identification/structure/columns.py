@@ -25,29 +25,24 @@ from diransac.data.units import conversion, one_turn
 from diransac.errors import DiransacError, TimeLimitError
 from diransac.identification.regression.rows import MotionRows, motion_rows
 from diransac.identification.structure.column_corrections import (
+    EXPLAINED,
     SAME_FACTOR,
     CorrectedEquations,
     CorrectionTests,
     corrections,
     explained,
-    nothing_to_explain,
     other_units,
 )
 from diransac.text_table import listed, number
 
 if TYPE_CHECKING:
     from diransac.data.log import Log
-    from diransac.identification.structure.column_corrections import Solver
     from diransac.model import Model
 
 FITTED_MOTION = "rows of the fitted motion"
 """Key under which a dataset keeps the rows of each log that a fit of its motion has."""
-_TINY = 1e-300
-# Samples over which changes are compared with integrals of derivatives; scatter of their ratios that is agreement;
-# changes that are enough.
-_SPANS, _AGREES, _CHANGES = (1, 4, 16, 64, 256), 0.25, 2000
-# Mismatch of kinematics over that without the correction, and of the next best correction over it.
-_MUCH_BETTER, _DISTINCT = 0.5, 1.5
+_SPANS = (1, 4, 16, 64, 256)
+"""Samples over which changes are compared with integrals of derivatives."""
 
 
 @dataclass(frozen=True)
@@ -87,34 +82,31 @@ def _scaled(names: Iterable[str], factor: float) -> str:
     return _again("scale", dict.fromkeys(names, f"{factor:.6g}"))
 
 
-def mistakes_of_columns(dataset: Dataset, nonlinear: Solver, *, delays: bool = True) -> tuple[list[Mistake], int]:
+def mistakes_of_columns(dataset: Dataset, *, delays: bool = True) -> tuple[list[Mistake], int]:
     """Mistakes that explain a bad answer, the clearest first, and the number of corrections that were tested.
 
     Parameters
     ----------
     dataset : Dataset
-    nonlinear : callable
-        Solution of a model that is not affine in its parameters, as `solved`.
     delays : bool, optional
         Whether delays of inputs are tested, which an estimate may include.
     """
-    found = contradictions(dataset.model, dataset.given) or _zero_inputs(dataset)
-    if found:
-        return found, 0
+    certain = contradictions(dataset.model, dataset.given) or _zero_inputs(dataset)
+    if certain:
+        return certain, 0
     try:
         model = dataset.model.with_sensors(())
         parts = [_middle(log) for log in dataset.given]
         complete = all(set(model.required_signals) <= set(log.signals) for log in parts)
-        logs = parts if complete else [differentiate(log, model) for log in parts]
-        other = Dataset.of(model, logs, pointwise=True)
-        return explanations(CorrectionTests(model, other.layout, motion_rows(other), nonlinear, delays), dataset.given)
+        derived = Dataset.of(model, parts if complete else [differentiate(x, model) for x in parts], pointwise=True)
+        return explanations(CorrectionTests(model, derived.layout, motion_rows(derived), delays), dataset.given)
     except TimeLimitError:
         raise
     except (DiransacError, np.linalg.LinAlgError):
         rows = dataset.kept(FITTED_MOTION, list[MotionRows])
         if not rows:
             return [], 0  # the equations cannot be evaluated on the logs
-        return explanations(CorrectionTests(dataset.model, dataset.layout, rows, nonlinear, delays), dataset.given)
+        return explanations(CorrectionTests(dataset.model, dataset.layout, rows, delays), dataset.given)
 
 
 def explanations(tests: CorrectionTests, logs: Sequence[Log]) -> tuple[list[Mistake], int]:
@@ -126,20 +118,16 @@ def explanations(tests: CorrectionTests, logs: Sequence[Log]) -> tuple[list[Mist
     logs : sequence of Log
         With the columns that a correction names.
     """
-    without = tests.without
-    if without is None:
-        return [], 0
-    if nothing_to_explain(tests):
+    if tests.need_no_correction:
         return [], sum(1 for _ in corrections(tests.model))
-    found, n_tested = explained(tests)
-    return ([_of_correction(tests, logs, found)] if found else []), n_tested
+    accepted, n_tested = explained(tests)
+    return ([_of_correction(tests, logs, accepted)] if accepted else []), n_tested
 
 
-def _of_correction(tests: CorrectionTests, logs: Sequence[Log], found: Sequence[CorrectedEquations]) -> Mistake:
+def _of_correction(tests: CorrectionTests, logs: Sequence[Log], accepted: Sequence[CorrectedEquations]) -> Mistake:
     """The mistake that one of alternative corrections mends, and how much better the equations hold with it."""
-    one, without, model = found[0].correction, tests.without, tests.model
-    assert without is not None
-    columns, ratio = _columns(model, logs, one.names), float((without.residuals / found[0].residuals).max())
+    one, without, model = accepted[0].correction, tests.without, tests.model
+    columns, ratio = _columns(model, logs, one.names), float((without.residuals / accepted[0].residuals).max())
     why = f"the equations hold up to {number(ratio, 2)} times as well"
     if one.exchanged:
         pairs = zip(_columns(model, logs, one.names[:1]), _columns(model, logs, one.names[1:]), strict=True)
@@ -154,47 +142,37 @@ def _of_correction(tests: CorrectionTests, logs: Sequence[Log], found: Sequence[
     what = _in_unit(one.names, one.unit, model.units[one.names[0]])
     if one.offset:
         return Mistake(what, f"with {them} plus {one.offset:g}, {why}", f"add {one.offset:g} to {listed(columns)}")
-    if len(found) > 1:
-        what = f"The sign of {' or '.join(listed(x.correction.names) for x in found)} is reversed"
+    if len(accepted) > 1:
+        what = f"The sign of {' or '.join(listed(x.correction.names) for x in accepted)} is reversed"
     if without.outside:
         values = dict(zip(tests.layout.names, without.parameters, strict=True))
         impossible = ", ".join(f"{n} = {values[n]:.4g}" for n in without.outside)
-        why += (
-            f", and {impossible}, outside the bounds as recorded, {'is' if len(without.outside) == 1 else 'are'} within"
-        )
+        are = "is" if len(without.outside) == 1 else "are"
+        why += f", and {impossible}, outside the bounds as recorded, {are} within"
     return Mistake(what, f"with {them} multiplied by {one.factor:.4g}, {why}", _scaled(columns, one.factor))
 
 
 def _columns(model: Model, logs: Sequence[Log], names: Sequence[str]) -> list[str]:
     """All columns of signals: derivatives change with a coordinate."""
-    chains = {chain[0]: chain for chain in model.chains}
+    chains = {x[0]: x for x in model.chains}
     return [n for name in names for n in chains.get(name, (name,)) if any(n in x.measured for x in logs)]
 
 
 def _middle(log: Log) -> Log:
-    """The middle of a long log, which is enough to find a mistake."""
-    enough = 5_000
-    first = max(0, (len(log) - enough) // 2)
-    return log[first : first + enough] if first else log
+    """The middle of a long log: 5,000 rows are enough to find a mistake."""
+    first = max(0, (len(log) - 5_000) // 2)
+    return log[first : first + 5_000] if first else log
 
 
 def _zero_inputs(dataset: Dataset) -> list[Mistake]:
     """Inputs of the equations that are zero throughout."""
-    used = set(dataset.model.required_signals)
-    inputs = [n for n in dataset.model.inputs if n in used]
+    inputs = [n for n in dataset.model.inputs if n in dataset.model.required_signals]
     zero = [n for n in inputs if all(n in log and not np.nan_to_num(log[n]).any() for log in dataset.given)]
     if not zero:
         return []
-    verb = "is" if len(zero) == 1 else "are"
-    evidence = f"{'its force is' if len(zero) == 1 else 'their forces are'} not in the equations"
-    return [
-        Mistake(
-            f"{listed(zero)} {verb} zero throughout",
-            evidence,
-            f"give the column that was recorded: --map {zero[0]}=COLUMN",
-            explains=False,
-        )
-    ]
+    are, forces = ("is", "its force is") if len(zero) == 1 else ("are", "their forces are")
+    action = f"give the column that was recorded: --map {zero[0]}=COLUMN"
+    return [Mistake(f"{listed(zero)} {are} zero throughout", f"{forces} not in the equations", action, explains=False)]
 
 
 # ---------------------------------------------------------------------- columns and their derivatives
@@ -212,24 +190,23 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     if wrapped:
         return wrapped
     prepared = [continuous(in_units(_middle(log).measured, model), model) for log in logs]
-    if model.kinematics is not None and not model.quaternions:
-        return _of_kinematics(model, prepared)
     ratios = list(_ratios(model, prepared))
-    named = [(x, culprit) for x in ratios if (culprit := _culprit(model, x.low, x.high, x.ratio)) is not None]
-    slow = next(
-        (u for u in ("ms", "us") if ratios and all(_is_near(x.ratio, _factor(u, "s") ** x.order) for x in ratios)), ""
-    )
+    clocks = {unit: conversion(unit, "s") or 1.0 for unit in ("ms", "us")}
+    slow = [u for u, x in clocks.items() if ratios and all(_is_near(r.ratio, x**r.order) for r in ratios)]
     if slow and len(ratios) > 1:
-        why = f"all derivatives are those of a clock that is {number(1.0 / _factor(slow, 's'))} times as fast"
-        return [Mistake(f"The time is in {slow}, not in s", why, _scaled(["t"], _factor(slow, "s")))]
+        why = f"all derivatives are those of a clock that is {number(1.0 / clocks[slow[0]])} times as fast"
+        return [Mistake(f"The time is in {slow[0]}, not in s", why, _scaled(["t"], clocks[slow[0]]))]
+    named = dict[tuple[str, float], list[tuple[_Ratio, tuple[str, ...]]]]()
+    for ratio in ratios:
+        for names, unit, factor in _culprits(model, ratio)[:1]:
+            named.setdefault((unit, factor), []).append((ratio, names))
     found = list[Mistake]()
-    for unit, factor in dict.fromkeys(culprit[1:] for _, culprit in named):
-        same = [(x, culprit[0]) for x, culprit in named if culprit[1:] == (unit, factor)]
-        names, (first, _) = list(dict.fromkeys(name for _, name in same)), same[0]
-        derivative = "second derivative" if first.order == 2 else "derivative"
-        why = f"the {derivative} of {first.low} is {number(first.ratio, 3)} times {first.high}"
-        why += f" (or the time is in {slow}: --scale t={_factor(slow, 's'):g})" if slow else ""
-        found.append(Mistake(_in_unit(names, unit, model.units[names[0]]), why, _scaled(names, factor)))
+    for (unit, factor), same in named.items():
+        columns, first = list(dict.fromkeys(n for _, names in same for n in names)), same[0][0]
+        what = f"the {'second derivative' if first.order == 2 else 'derivative'} of {first.low}"
+        why = f"{what} is {number(first.ratio, 3)} times {first.should_be}"
+        why += f" (or the time is in {slow[0]}: --scale t={clocks[slow[0]]:g})" if slow else ""
+        found.append(Mistake(_in_unit(columns, unit, model.units[columns[0]]), why, _scaled(columns, factor)))
     return found
 
 
@@ -241,160 +218,115 @@ def wraps(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     model : Model
     logs : sequence of Log
     """
-    found = dict[str, float]()
-    for log in logs:
-        log = in_units(log, model)
+    found = dict[str, Mistake]()
+    for log in (in_units(x, model) for x in logs):
         for name in (n for n in model.coordinates if n in log and n not in found):
-            own = one_turn(model.units[name])
-            period = wrap_period(log[name], (*_turns(model.units[name]), *([own] if own else [])))
-            found |= {} if period in (None, own) else {name: period}
-    return [_of_wrap(model, name, period) for name, period in found.items()]
-
-
-def _turns(unit: str) -> dict[float, str]:
-    """One turn in other units of angles than that of a coordinate, as numbers that its column has, with the unit."""
-    return {turn: other for other, _ in other_units(unit) if one_turn(unit) and (turn := one_turn(other))}
-
-
-def _of_wrap(model: Model, name: str, period: float) -> Mistake:
-    """The mistake of a coordinate that wraps."""
-    unit = model.units[name]
-    leaps = f"it leaps by {number(period)} from one of its ends to the other, and nowhere else"
-    if (other := _turns(unit).get(period)) is not None:
-        return Mistake(
-            _in_unit([name], other, unit),
-            f"{leaps}, which is one turn in {other}",
-            _scaled([name], _factor(other, unit)),
-        )
-    return Mistake(
-        f"{name} wraps, as a counter of limited bits does", leaps, _again("unwrap", {name: f"{period:.10g}"})
-    )
-
-
-def _of_kinematics(model: Model, logs: Sequence[Log]) -> list[Mistake]:
-    """Coordinates or velocities in other units, with which the kinematics ``dq/dt = k(q, v)`` hold much better."""
-    rates = model.velocities_of_motion
-    names = (*model.coordinates, *rates)
-    if not all(n in log for log in logs for n in names):
-        return []
-    columns = [(np.stack([np.nan_to_num(log[n]) for n in names]), log.dt) for log in logs]
-
-    def mismatch(group: Sequence[str], factor: float) -> float:
-        factors = np.where([n in group for n in names], factor, 1.0)[:, None]
-        return min(_mismatch(model, [(x * factors, dt) for x, dt in columns], span) for span in _SPANS[:4])
-
-    found, as_recorded = list[tuple[float, tuple[str, ...], str, float]](), mismatch((), 1.0)
-    for kind in (model.coordinates, rates):
-        for unit in dict.fromkeys(kind.values()):
-            same = tuple(n for n, x in kind.items() if x == unit)
-            for group in dict.fromkeys([*((n,) for n in same), same]):
-                found += [(mismatch(group, x), group, other, x) for other, x in [*other_units(unit), ("", -1.0)]]
-    found.sort(key=lambda x: (x[0], len(x[1])))
-    best, group, unit, factor = found[0]
-    if best > min(_AGREES, _MUCH_BETTER * as_recorded) or found[1][0] < _DISTINCT * best:
-        return []
-    ratio = number(as_recorded / best, 2)
-    why = f"with this corrected, the kinematics of the model hold {ratio} times as well"
-    return [Mistake(_in_unit(group, unit, model.units[group[0]]), why, _scaled(group, factor))]
-
-
-def _mismatch(model: Model, columns: Sequence[tuple[FloatArray, float]], span: int) -> float:
-    """Changes of coordinates over some samples less the integrals of their rates, over the changes, by medians."""
-    assert model.kinematics is not None
-    errors, changes = [], []
-    for both, dt in columns:
-        q, v = both[: model.n_q], both[model.n_q :]
-        whole = np.zeros((len(q) + len(model.velocities) - len(v), q.shape[1]))
-        rates = np.array(model.kinematics(q, np.vstack([v, whole[len(q) :]])))
-        steps = np.cumsum(0.5 * dt * (rates[:, 1:] + rates[:, :-1]), axis=1)
-        change = q[:, span + 1 :] - q[:, 1:-span]
-        errors.append(change - (steps[:, span:] - steps[:, :-span]))
-        changes.append(change)
-    sizes = np.median(np.abs(np.concatenate(changes, axis=1)), axis=1) + _TINY
-    found = float((np.median(np.abs(np.concatenate(errors, axis=1)), axis=1) / sizes).mean())
-    return found if np.isfinite(found) else np.inf
+            unit = model.units[name]
+            own = one_turn(unit)
+            turns = {turn: (u, x) for u, x in other_units(unit) if own and (turn := one_turn(u))}
+            period = wrap_period(log[name], (*turns, *([own] if own else [])))
+            if period in (None, own):
+                continue
+            leaps = f"it leaps by {number(period)} from one of its ends to the other, and nowhere else"
+            if period in turns:
+                other, factor = turns[period]
+                why = f"{leaps}, which is one turn in {other}"
+                found[name] = Mistake(_in_unit([name], other, unit), why, _scaled([name], factor))
+            else:
+                what = f"{name} wraps, as a counter of limited bits does"
+                found[name] = Mistake(what, leaps, _again("unwrap", {name: f"{period:.10g}"}))
+    return list(found.values())
 
 
 @dataclass(frozen=True)
 class _Ratio:
-    """Ratio of a derivative of a column, of order 1 or 2, and the column that should be it."""
+    """Ratio of a derivative of a column, of order 1 or 2, and what it should be: a column, or kinematics of several."""
 
     low: str
-    high: str
+    high: tuple[str, ...]
     order: int
     ratio: float
+    should_be: str
 
 
 def _ratios(model: Model, logs: Sequence[Log]) -> Iterator[_Ratio]:
     """Ratios of all columns whose derivative is measured, too, where derivative and column agree but for a factor."""
-    for chain in model.chains:
-        known = [n for n in chain if all(n in log for log in logs)]
-        for low, high in pairwise(known):
-            order = chain.index(high) - chain.index(low)
-            ratio = _ratio([(log[low], log[high], log.dt) for log in logs], order)
-            if ratio is not None:
-                yield _Ratio(low, high, order, ratio)
+    chains, motion = model.chains, (*model.coordinates, *model.velocities_of_motion)
+    if model.kinematics is not None and not model.quaternions and all(n in log for log in logs for n in motion):
+        chains, by_log = chains[model.n_q :], [_coordinate_rates(model, log) for log in logs]
+        equations, arguments = model.kinematics.jac_sparsity(0, 1).get_triplet()
+        for i, low in enumerate(model.coordinates):
+            speeds = tuple(list(model.velocities)[k] for row, k in zip(equations, arguments, strict=True) if row == i)
+            columns = [(log[low], rates[i], log.dt) for log, rates in zip(logs, by_log, strict=True)]
+            yield from (_Ratio(low, speeds, 1, x, "that of the kinematics") for x in _ratio(columns, 1) if speeds)
+    for names in chains:
+        for low, high in pairwise(n for n in names if all(n in log for log in logs)):
+            order = names.index(high) - names.index(low)
+            columns = [(log[low], log[high], log.dt) for log in logs]
+            yield from (_Ratio(low, (high,), order, x, high) for x in _ratio(columns, order))
+
+
+def _coordinate_rates(model: Model, log: Log) -> FloatArray:
+    """Derivatives ``(n_q, N)`` of the coordinates by the kinematics ``k(q, v)``."""
+    assert model.kinematics is not None
+    names = (*model.coordinates, *model.velocities_of_motion)
+    columns = {n: np.zeros(len(log)) for n in model.state} | {n: np.nan_to_num(log[n]) for n in names}
+    q, v = (np.stack([columns[n] for n in x]) for x in (model.coordinates, model.velocities))
+    return np.array(model.kinematics(q, v))
 
 
 def _in_unit(names: Sequence[str], unit: str, wanted: str) -> str:
     """``theta is in deg, not in rad``; or that a sign is reversed, for an empty unit."""
-    one = len(names) == 1
-    if not unit:
-        return f"The {'sign' if one else 'signs'} of {listed(names)} {'is' if one else 'are'} reversed"
-    return f"{listed(names)} {'is' if one else 'are'} in {unit}, not in {wanted}"
+    signs, are = ("sign", "is") if len(names) == 1 else ("signs", "are")
+    return (
+        f"{listed(names)} {are} in {unit}, not in {wanted}"
+        if unit
+        else f"The {signs} of {listed(names)} {are} reversed"
+    )
 
 
-def _culprit(model: Model, low: str, high: str, ratio: float) -> tuple[str, str, float] | None:
-    """Column, unit and factor that explain the ratio of a derivative and its column; None without one."""
-    found = [(high, unit, factor, factor) for unit, factor in other_units(model.units[high])]
-    found += [(low, unit, factor, 1.0 / factor) for unit, factor in other_units(model.units[low])]
-    found.append((high, "", -1.0, -1.0))
-    near = [x for x in found if _is_near(ratio, x[3])]
-    return min(near, key=lambda x: abs(np.log(ratio / x[3])))[:3] if near else None
+def _culprits(model: Model, ratio: _Ratio) -> list[tuple[tuple[str, ...], str, float]]:
+    """Columns, units and factors that explain the ratio of a derivative and its column, the likeliest first."""
+    units = ((ratio.high, 1.0), ((ratio.low,), -1.0))
+    found = [(names, unit, x, x**way) for names, way in units for unit, x in other_units(model.units[names[0]])]
+    near = [x for x in [*found, (ratio.high, "", -1.0, -1.0)] if _is_near(ratio.ratio, x[3])]
+    return [x[:3] for x in sorted(near, key=lambda x: abs(np.log(ratio.ratio / x[3])))]
 
 
 def _is_near(ratio: float, factor: float) -> bool:
     return bool(ratio / factor > 0.0 and abs(np.log(ratio / factor)) < SAME_FACTOR)
 
 
-def _factor(unit: str, wanted: str) -> float:
-    """Factor between units of one dimension."""
-    factor = conversion(unit, wanted)
-    assert factor is not None
-    return factor
-
-
-def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) -> float | None:
-    """Ratio of the derivatives of columns and other columns of several logs; None where nothing agrees.
+def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) -> list[float]:
+    """Ratio of the derivatives of columns and other columns of several logs; none where nothing agrees.
 
     Changes over some samples are compared with integrals, which need no derivative of noise.
     """
     filled = [(_filled(low), _filled(high), dt) for low, high, dt in pairs]
     known = [(low, high, dt) for low, high, dt in filled if low is not None and high is not None]
-    least, found = _AGREES, None
+    least, found, tiny = EXPLAINED, list[float](), np.finfo(float).tiny
     for span in _SPANS:
-        changes = [_changes(*one, order, span) for one in known if order * span <= len(one[0]) // 4]
+        changes = [_changes(*one, order, span) for one in known if 4 * order * span <= len(one[0])]
         if not changes:
             break
         y, x = np.concatenate(changes, axis=1)
-        large = np.abs(x) > max(float(np.median(np.abs(x))), _TINY)
+        large = np.abs(x) > max(float(np.median(np.abs(x))), tiny)
         ratios = y[large] / x[large]
         middle = float(np.median(ratios)) if len(ratios) else 0.0
-        scatter = float(np.median(np.abs(ratios - middle))) / (abs(middle) + _TINY) if len(ratios) else np.inf
+        scatter = float(np.median(np.abs(ratios - middle))) / (abs(middle) + tiny) if len(ratios) else np.inf
         if scatter < least:
-            least, found = scatter, middle
+            least, found = scatter, [middle]
     return found
 
 
 def _changes(low: FloatArray, high: FloatArray, dt: float, order: int, span: int) -> FloatArray:
     """Changes (2, n) of a column, and of the integral of another one, over some samples, each as often as the order."""
     for _ in range(order):
-        high = np.concatenate([[0.0], np.cumsum(0.5 * dt * (high[1:] + high[:-1]))])
+        high = np.r_[0.0, np.cumsum(0.5 * dt * (high[1:] + high[:-1]))]
     both = np.stack([low, high])
-    some = np.arange(0, both.shape[1] - order * span, max(1, (both.shape[1] - order * span) // _CHANGES))
-    if order == 1:
-        return both[:, some + span] - both[:, some]
-    return both[:, some + 2 * span] - 2.0 * both[:, some + span] + both[:, some]
+    for _ in range(order):
+        both = both[:, span:] - both[:, :-span]
+    return both
 
 
 def _filled(x: FloatArray) -> FloatArray | None:

@@ -28,11 +28,6 @@ from diransac.identification.regression.rows import MotionRows
 from diransac.model import Model
 from diransac.text_table import number
 
-_EXACT, _NONE = 1e-6, 1e-3
-"""Part of a change of unit that parameters leave, up to which they take it up; exponent that is zero."""
-_ENOUGH = 1000
-"""Rows of each log, at most: enough for ranks."""
-
 KnownUpTo = tuple[tuple[str, ...], str]
 """Names of parameters of which only a combination is determined, and a sentence about them."""
 
@@ -63,20 +58,17 @@ def known_up_to_units(
     chains = [x for x in model.chains if not set(x).isdisjoint(unmeasured)]
     if not chains or not layout.is_shared:
         return []
-    A = _changes(model, rows, parameters, chains, readings)
-    found, n = list[KnownUpTo](), model.n_p
-    pinned = np.isfinite(layout.prior_std)
+    A = _changes(model, rows, parameters, tuple(chains), readings)
+    found, n = dict[tuple[str, ...], str](), model.n_p
+    values, pinned = dict(zip(layout.names, parameters, strict=True)), np.isfinite(layout.prior_std)
     for k, chain in enumerate(chains):
-        others = np.delete(A, n + k, axis=1)
+        others, of_unit = np.delete(A, n + k, axis=1), A[:, n + k]
         others[:, :n][:, pinned] = 0.0
-        x = np.linalg.lstsq(others, -A[:, n + k], rcond=1e-9)[0]
-        left = np.linalg.norm(others @ x + A[:, n + k])
-        exponents = {name: e for name, e in zip(layout.names, x[:n], strict=True) if abs(e) > _NONE}
-        if left <= _EXACT * np.linalg.norm(A[:, n + k]) and exponents:
-            found.append(
-                (tuple(exponents), _sentence(chain[0], exponents, dict(zip(layout.names, parameters, strict=True))))
-            )
-    return list(dict(found).items())
+        x = np.linalg.lstsq(others, -of_unit, rcond=1e-9)[0]
+        exponents = {name: e for name, e in zip(layout.names, x[:n], strict=True) if abs(e) > 1e-3}
+        if exponents and np.linalg.norm(others @ x + of_unit) <= 1e-6 * np.linalg.norm(of_unit):
+            found[tuple(exponents)] = _sentence(chain[0], exponents, values)
+    return list(found.items())
 
 
 def _sentence(state: str, exponents: dict[str, float], values: dict[str, float]) -> str:
@@ -96,21 +88,19 @@ def _changes(
     model: Model,
     rows: Sequence[MotionRows],
     parameters: FloatArray,
-    chains: Sequence[tuple[str, ...]],
+    chains: tuple[tuple[str, ...], ...],
     readings: Sequence[str],
 ) -> FloatArray:
     """Columns ``(K, n_p + n_chains + n_v)``: changes of residuals and readings by parameters, units and equations."""
-    function, parts, rng = _generators(model, tuple(chains)), [], np.random.default_rng(0)
+    function, parts, rng = _generators(model, chains), [], np.random.default_rng(0)
     kept = [*range(model.n_v), *(model.n_v + k for k, name in enumerate(model.sensors) if name in readings)]
     for one in rows:
-        every = max(1, len(one.q) // _ENOUGH)
+        every = max(1, len(one.q) // 1000)  # enough for ranks
         motion = [rng.permuted(x[::every], axis=0).T for x in (one.q, one.v, one.a, one.u)]
         n = motion[0].shape[1]
         both = np.array(ca.densify(function(*motion, np.repeat(parameters[:, None], n, axis=1))))
         columns = both.reshape(both.shape[0], n, -1).transpose(1, 0, 2)[:, kept]
-        of_equations = np.zeros((n, len(kept), model.n_v))
-        place = np.arange(model.n_v)
-        of_equations[:, place, place] = -columns[:, : model.n_v, -1]
+        of_equations = -columns[:, :, -1:] * np.eye(len(kept), model.n_v)
         parts.append(np.concatenate([columns[:, :, :-1], of_equations], axis=2))
     A = np.concatenate(parts)
     A = A[np.isfinite(A).all(axis=(1, 2))]

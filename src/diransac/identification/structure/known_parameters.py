@@ -48,7 +48,7 @@ class KnownParameters:
     """
 
     model: Model
-    fixed: Mapping[str, float] = field(default_factory=dict)
+    fixed: dict[str, float] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
@@ -104,13 +104,13 @@ class KnownParameters:
     @cached_property
     def _late(self) -> tuple[str, ...]:
         """Parameters with a prior in the same ambiguity as one that is held: combined with the finished estimate."""
-        groups = structural(self.model.with_fixed(self.fixed)) if self.held else ()
-        names = [n for x in groups if set(x.names) & set(self.held) for n in x.names]
+        groups = [x.names for x in structural(self.model.with_fixed(self.fixed))] if self.held else []
+        names = [n for group in groups if set(group) & set(self.held) for n in group]
         return tuple(n for n in names if n in self.priors and n not in self.held)
 
     def free(self) -> Model:
         """The model whose parameters are those to be identified."""
-        return self.model.with_fixed({**self.fixed, **{n: self.priors[n][0] for n in self.held}})
+        return self.model.with_fixed(self.fixed | {n: self.priors[n][0] for n in self.held})
 
     @property
     def priors_of_fit(self) -> dict[str, tuple[float, float]]:
@@ -135,11 +135,10 @@ class KnownParameters:
         if not (self.fixed or self.held):
             return estimate
         layout = ParameterLayout(self.model.parameters, n_logs, self.priors)
-        known = {**self.fixed, **{n: self.priors[n][0] for n in self.held}}
+        known = self.fixed | {n: self.priors[n][0] for n in self.held}
         owned = zip(layout.names, layout.owners, strict=True)
-        every = {n: estimate.parameters.get(n, known.get(owner, np.nan)) for n, owner in owned}
-        values, covariance = np.array(list(every.values())), np.zeros((len(layout), len(layout)))
-        places = [layout.names.index(n) for n in estimate.parameters]
+        values = np.array([estimate.parameters.get(n, known.get(owner, np.nan)) for n, owner in owned])
+        covariance, places = np.zeros((len(layout), len(layout))), [layout.names.index(n) for n in estimate.parameters]
         covariance[np.ix_(places, places)] = estimate.covariance
         if self.held:
             values, covariance = self._with_held(layout, values, covariance)
@@ -154,12 +153,11 @@ class KnownParameters:
         self, layout: ParameterLayout, values: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Values and covariance with the uncertainty of the parameters that are held, and late priors."""
-        names, changes = list(self.model.parameters), np.zeros((len(layout), len(self.held)))
-        free = np.array([i for i, n in enumerate(names) if n not in self.fixed])
+        changes = np.zeros((len(layout), len(self.held)))
+        free = np.array([n not in self.fixed for n in self.model.parameters])
         model = self.model.with_fixed(self.fixed)
         given = np.array([list(model.parameters).index(n) for n in self.held])
-        for i in range(layout.n_logs):
-            own = layout.index[i, free]
+        for own in layout.index[:, free]:
             changes[own] = structural_slopes(model, values[own], given)
         changes *= [self.priors[n][1] for n in self.held]
         late = np.array([k for k, n in enumerate(layout.owners) if n in self._late], np.int64)
@@ -175,23 +173,19 @@ class KnownParameters:
         code, *others = (
             re.sub(rf"\bp\.{found.parameter}\b", f"p.{name}", x) for x in (found.code, *found.also.values())
         )
-        sizes = {**self.model.argument_sizes, "p": self.model.n_p - len(constants)}
-        term = expressions.restored("term", found.term, sizes, {"h": self.model.n_v})
-        q, v, a, u = (ca.SX.sym(n, sizes[n]) for n in "qvau")
-        p = ca.vertcat(*(ca.SX.sym(n) for n in self.model.parameters))
-        every = zip(self.model.parameters, ca.vertsplit(p), strict=True)
-        own = ca.vertcat(*(x for n, x in every if n not in constants))
-        h = ca.Function("term", [q, v, a, u, p], [term(q, v, a, u, own)], list("qvaup"), ["h"])
+        sizes = self.model.argument_sizes
+        term = expressions.restored("term", found.term, {**sizes, "p": sizes["p"] - len(constants)}, {"h": sizes["v"]})
+        symbols = [ca.SX.sym(n, size) for n, size in sizes.items()]
+        own = [k for k, n in enumerate(self.model.parameters) if n not in constants]
+        h = ca.Function("term", symbols, [term(*symbols[:4], symbols[4][own])], list(sizes), ["h"])
         also, stored = dict(zip(found.also, others, strict=True)), expressions.stored(f"parameter {name}", h)
         return replace(found, parameter=name, code=code, term=stored, also=also)
 
 
 def _as_mapping(fixed: object) -> Mapping[str, object]:
     """Values by name; None where the nominal value is meant."""
-    if fixed is None:
-        return {}
-    if isinstance(fixed, Mapping):
-        return fixed
+    if fixed is None or isinstance(fixed, Mapping):
+        return fixed or {}
     if isinstance(fixed, str) or not isinstance(fixed, Iterable):
         raise SettingsError(f'fixed is {fixed!r:.60}; give values, {{"mass": 0.25}}, or names, ["mass"]')
     return dict.fromkeys(fixed)
@@ -214,8 +208,8 @@ def _prior(model: Model, name: str, pair: object) -> tuple[float, float]:
     check_known([name], model.parameters, f'priors: model "{model.name}" has no parameter', "it has")
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise SettingsError(f"the prior of {name} is {pair!r:.60}; give its mean and standard deviation")
-    mean = finite_number(f"the prior mean of {name}", pair[0])
-    std = finite_number(f"the prior standard deviation of {name}", pair[1])
+    words = ("mean", "standard deviation")
+    mean, std = (finite_number(f"the prior {word} of {name}", x) for word, x in zip(words, pair, strict=True))
     if not std > 0.0:
         raise SettingsError(f"the prior standard deviation of {name} is {std:g}; give a positive number, or fix {name}")
     if not model.parameters[name].admits(mean):

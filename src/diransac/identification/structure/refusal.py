@@ -114,13 +114,12 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     found = None if model.nonlinear_parameters else solved(model, layout, logs)
     if any(x.noun == "ratio" for x in of_model) or (found is None and of_model):
         return equations_in_words(of_model)
+    names = ", ".join(layout.names)
+    if model.nonlinear_parameters:
+        why = "no simulation within the bounds follows the log"
+        return f"{names} cannot be estimated, since {why}; give narrower bounds, or {_ADVICE}"
     if found is None:
-        if model.nonlinear_parameters:
-            why = "no simulation within the bounds follows the log"
-            return f"{', '.join(layout.names)} cannot be estimated, since {why}; give narrower bounds, or {_ADVICE}"
-        return (
-            f"{', '.join(layout.names)} cannot be estimated: in each row of the log the equations overflow; {_ADVICE}"
-        )
+        return f"{names} cannot be estimated: in each row of the log the equations overflow; {_ADVICE}"
     if not found.has_known_terms:
         return _no_known_terms(model, layout, logs)
     return _cause_of_solution(layout, len(logs), found, of_model)
@@ -187,14 +186,13 @@ def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:
         Of its motion.
     """
     model, layout = dataset.model, dataset.layout
-    signed = {
-        n for n, x in zip(layout.names, layout.bounds, strict=True) if x.positive or x.lower >= 0.0 or x.upper <= 0.0
-    }
+    bounds = zip(layout.names, layout.bounds, strict=True)
+    signed = {n for n, x in bounds if x.positive or x.lower >= 0.0 or x.upper <= 0.0}
     if model.nonlinear_parameters or structural(model, ranges=_ranges(model, rows)):
         return
     found = solved(model, layout, rows)
     if found is None or not signed or not signed <= set(layout.violations(found.parameters)):
         return
-    mistakes, _ = explanations(CorrectionTests(model, layout, rows, solved), dataset.given)
+    mistakes, _ = explanations(CorrectionTests(model, layout, rows), dataset.given)
     if mistakes and "reversed" in mistakes[0].what:
         raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -32,13 +32,12 @@ from diransac.identification.structure.identifiability import (
 )
 from diransac.model import Model, Parameter
 
-# Half the range of a signal of which no log shows it.
 _HALF_RANGE = 10.0
-
-
-# Singular value over the largest below which it is zero: of dr/dp, and of sensitivities, whose sizes differ by decades
-# and which are rounded to a few 1e-12.
-_RANK, _RANK_OF_OUTPUTS = 1e-9, 1e-11
+"""Half the range of a signal of which no log shows it, in its unit."""
+_RANK = 1e-9
+"""Singular value of dr/dp over the largest, up to which it is zero."""
+_RANK_OF_OUTPUTS = 1e-11
+"""The same of sensitivities, whose sizes differ by decades, and which are rounded to a few 1e-12."""
 Ranges = tuple[tuple[str, float, float], ...]
 """Smallest and largest value of states and inputs, by name."""
 
@@ -78,33 +77,23 @@ def structural(
     rng = np.random.default_rng(20240607)
     bounds = list(model.parameters.values())
     free = np.flatnonzero([x.lower < x.upper for x in bounds])
-    vectors = [_random_parameters(bounds, rng) for _ in range(3)]
-
-    def jacobian(p: FloatArray, ranges: Ranges) -> FloatArray:
-        if measured is None:
-            return _random_jacobian(model, p, rng, ranges)
-        return _output_jacobian(model, p, rng, measured, ranges)
-
-    jacobians = [np.concatenate([jacobian(p, x) for x in ((), ranges) if x is not None])[:, free] for p in vectors]
+    jacobian = _random_jacobian if measured is None else partial(_output_jacobian, measured=measured)
+    vectors, motions = [_random_parameters(bounds, rng) for _ in range(3)], [x for x in ((), ranges) if x is not None]
+    jacobians = [np.concatenate([jacobian(model, p, rng, x) for x in motions])[:, free] for p in vectors]
     if not len(free) or min(map(len, jacobians)) < len(free):
         return ()
     spaces = [_null_space(J, _RANK if measured is None else _RANK_OF_OUTPUTS) for J in jacobians]
     if len({len(x.directions) for x in spaces}) > 1:
         return ()
-    names = np.array(list(model.parameters))[free]
-    found = []
+    names, found = np.array(list(model.parameters))[free], list[Ambiguity]()
     for group in components(spaces[0].directions, 1e-5):
-        parts = [x.of(group) for x in spaces]
-        found.append(ambiguity_of(names[group].tolist(), parts, [p[free][group] for p in vectors]))
-    if measured is not None:
-        found = [replace(x, reason="since not all states are measured" if x.n_determined else "") for x in found]
-    elif not model.nonlinear_parameters:
-        found = [
-            replace(x, reason="since each term has one of them as a factor (b = 0 in W p = b)")
-            if x.noun == "ratio"
-            else x
-            for x in found
-        ]
+        own, reason = [p[free][group] for p in vectors], ""
+        one = ambiguity_of(names[group].tolist(), [x.of(group) for x in spaces], own)
+        if measured is not None and one.n_determined:
+            reason = "since not all states are measured"
+        elif measured is None and one.noun == "ratio" and not model.nonlinear_parameters:
+            reason = "since each term has one of them as a factor (b = 0 in W p = b)"
+        found.append(replace(one, reason=reason))
     every = joined(found)
     if any(not x.n_determined and _in_equations(model) & set(x.names) for x in every):
         where = "at random motions" if ranges is None else "at any motion in the ranges of the log"
@@ -186,8 +175,9 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, rang
     n = max(60, 4 * model.n_p)
     middle, half = (x[:, None] for x in _centres(model, ranges))
     sizes = (model.n_q, model.n_v, model.n_u)
-    drawn = middle + half * np.concatenate([_random_numbers((size, n), rng) for size in sizes])
-    q, v, u = np.split(drawn, np.cumsum(sizes)[:2])
+    # Numbers of both signs, up to 1 and over three decades: a saturation is neither always on nor never.
+    parts = [rng.choice([-1.0, 1.0], (size, n)) * 10.0 ** rng.uniform(-3.0, 0.0, (size, n)) for size in sizes]
+    q, v, u = np.split(middle + half * np.concatenate(parts), np.cumsum(sizes)[:2])
     for four in model.quaternions:
         q[list(four)] /= np.linalg.norm(q[list(four)], axis=0)
     repeated = np.repeat(p[:, None], n, axis=1)
@@ -200,52 +190,44 @@ def _random_jacobian(model: Model, p: FloatArray, rng: np.random.Generator, rang
 
 
 def _output_jacobian(
-    model: Model, p: FloatArray, rng: np.random.Generator, measured: Sequence[str], ranges: Ranges
+    model: Model, p: FloatArray, rng: np.random.Generator, ranges: Ranges, measured: Sequence[str]
 ) -> FloatArray:
     """Derivatives ``(n, n_p)`` of measured signals in random motions, without what initial states can explain.
 
     Four motions are sequences of Euler's steps, which have the symmetries of the equations: two per unknown, each a
     fifth of the fastest time constant.
     """
-    n_x, n_q, sensor_slopes = len(model.state), model.n_q, _sensor_slopes(model)
+    n_x, n_p, sensor_slopes = len(model.state), model.n_p, _sensor_slopes(model)
     middle, half = _centres(model, ranges)
     half = half / (1.0 if ranges else _HALF_RANGE)
-    rows, blocks = [model.signals.index(n) for n in measured], []
+    rows, of_parameters, blocks = [model.signals.index(n) for n in measured], np.eye(n_x + n_p)[n_x:], []
     for _ in range(4):
-        x, step = middle[:n_x] + half[:n_x] * rng.normal(size=n_x), 0.0
-        of_x, of_p, seen_x, seen_p = np.eye(n_x), np.zeros((n_x, model.n_p)), list[FloatArray](), list[FloatArray]()
-        for _ in range(2 * (n_x + model.n_p)):
+        x, step, seen = middle[:n_x] + half[:n_x] * rng.normal(size=n_x), 0.0, list[FloatArray]()
+        changes = np.eye(n_x, n_x + n_p)  # of the state, by the initial state and the parameters
+        for _ in range(2 * (n_x + n_p)):
             for four in model.quaternions:
                 x[list(four)] /= np.linalg.norm(x[list(four)])
             u = middle[n_x:] + half[n_x:] * rng.normal(size=model.n_u)
             A, _, P = (np.array(ca.DM(J)) for J in model.rate_jacobians(x, u, p))
             step = step or 0.2 / max(1.0, float(np.linalg.norm(A)))
-            moved_x, moved_p = A @ of_x, A @ of_p + P
+            moved = A @ changes + P @ of_parameters
             x_dot, a = (np.array(value).ravel() for value in model.dynamics(x, u, p))
-            C, D, S = (np.array(ca.DM(J)) for J in sensor_slopes(x, a, u, p))
-            seen_x.append(np.vstack([of_x, moved_x[n_q:], C @ of_x + D @ moved_x[n_q:]])[rows])
-            seen_p.append(np.vstack([of_p, moved_p[n_q:], C @ of_p + D @ moved_p[n_q:] + S])[rows])
-            x = x + step * x_dot
-            of_x, of_p = of_x + step * moved_x, of_p + step * moved_p
-        J_x, J_p = np.concatenate(seen_x), np.concatenate(seen_p)
-        if np.isfinite(J_x).all() and np.isfinite(J_p).all():
-            U, sizes, _ = np.linalg.svd(J_x, full_matrices=False)
+            of_sensors = np.array(ca.DM(sensor_slopes(x, a, u, p)))
+            motion = np.vstack([changes, moved[model.n_q :]])
+            seen.append(np.vstack([motion, of_sensors @ np.vstack([motion, of_parameters])])[rows])
+            x, changes = x + step * x_dot, changes + step * moved
+        J = np.concatenate(seen)
+        if np.isfinite(J).all():
+            U, sizes, _ = np.linalg.svd(J[:, :n_x], full_matrices=False)
             U = U[:, sizes > _RANK_OF_OUTPUTS * sizes[0]]
-            blocks.append(J_p - U @ (U.T @ J_p))
-    return np.concatenate(blocks) if blocks else np.zeros((0, model.n_p))
+            blocks.append(J[:, n_x:] - U @ (U.T @ J[:, n_x:]))
+    return np.concatenate(blocks) if blocks else np.zeros((0, n_p))
 
 
 def _sensor_slopes(model: Model) -> ca.Function:
-    """Function ``(x, a, u, p) -> dy/d(x, a, p)`` of the sensors, three matrices."""
-    sizes = {"x": len(model.state), "a": model.n_v, "u": model.n_u, "p": model.n_p}
-    x, a, u, p = (ca.SX.sym(name, n) for name, n in sizes.items())
-    y = model.readings(x, a, u, p)
-    return ca.Function("sensor_slopes", [x, a, u, p], [ca.jacobian(y, z) for z in (x, a, p)])
-
-
-def _random_numbers(shape: tuple[int, int], rng: np.random.Generator) -> FloatArray:
-    """Numbers of both signs, up to 1 and over three decades: a saturation is neither always on nor never."""
-    return np.asarray(rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(-3.0, 0.0, shape))
+    """Function ``(x, a, u, p) -> dy/d(x, a, p)`` of the sensors."""
+    x, a, u, p = symbols = model.readings.sx_in()
+    return ca.Function("sensor_slopes", symbols, [ca.jacobian(model.readings(x, a, u, p), ca.vertcat(x, a, p))])
 
 
 def _null_space(J: FloatArray, rank: float) -> NullSpace:
@@ -305,9 +287,9 @@ def unidentifiable(
     known += [(x.names, in_words([x], layout.n_logs)) for x in from_log if x.n_determined]
     sentences = [*(text for _, text in known), *(x.sentence(x.of_equations()) for x in of_model if not x.n_determined)]
     alone = [n for x in from_log if not x.n_determined for n in x.names]
-    seen = dict(zip(layout.names, np.zeros(len(uncertain), bool) if excited is None else excited, strict=True))
+    seen = set() if excited is None else {n for n, x in zip(layout.names, excited, strict=True) if x}
     for is_seen in (False, True):
-        names = tuple(n for n in alone if seen[n] == is_seen)
+        names = tuple(n for n in alone if (n in seen) == is_seen)
         if names:
             x = Ambiguity(names, 0, ())
             sentences.append(x.sentence(x.of_noise() if is_seen else x.of_motion(), of_logs(layout.n_logs)))
