@@ -6,7 +6,7 @@ the parameters and the unmodelled accelerations, and so in every residual: of th
 the unmodelled accelerations from their prior.  Long logs are solved section by section, and a batch of neighbouring
 intervals is kept as the triangle of its residuals, which takes a fraction of the memory.
 
-Estimates of single terms are those of a score test (`core/columns.py`).  The residuals themselves are needed beside them:
+Estimates of single terms are those of a score test (`core`).  The residuals themselves are needed beside them:
 their products scatter from interval to interval as unmodelled forces do, which no score of the measurements alone
 shows, and terms are tested beside others that have been selected.
 
