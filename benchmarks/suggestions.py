@@ -367,8 +367,8 @@ class Case:
 
 PARTS: dict[str, tuple[str, object]] = {
     "connections": ("missing_terms.connections", lambda *_: []),
-    "samples": ("missing_terms._parts", lambda *_: 1),
-    "pairs": ("term_evidence.CandidateTests._pairs", lambda _: (np.zeros((0, 2), int), np.zeros(0))),
+    "samples": ("missing_terms.parts_of_intervals", lambda *_: 1),
+    "pairs": ("missing_terms.Candidates._pairs", lambda _: (np.zeros((0, 2), int), np.zeros(0))),
 }
 """What can be left out: terms between bodies, tests at every sample, pairs of terms."""
 CASES = {

@@ -9,14 +9,10 @@ import pytest
 
 import diransac as dr
 from command_line import run_both
-from diransac.identification.methods.lo_diransac import term_evidence
-from diransac.identification.methods.lo_diransac.term_evidence import (
-    CandidateTests,
-    TermRegression,
-    posterior,
-    probabilities,
-)
-from diransac.identification.structure.candidate_terms import candidate_terms
+from diransac.identification.methods.lo_diransac import term_regression
+from diransac.identification.methods.lo_diransac.missing_terms import Candidates, posterior, probabilities
+from diransac.identification.methods.lo_diransac.term_regression import TermRegression
+from diransac.identification.structure.candidate_terms import CandidateTerms, candidate_terms
 from diransac.identification.structure.lacking_terms import PossibleTerm, mixture_intervals
 
 # ---------------------------------------------------------------------- the mixture, by brute force
@@ -39,7 +35,7 @@ def candidates_of_line(x, terms, y, noise, kinds):
         -(x @ terms)[None, :] / (x @ x), np.square(columns).sum(axis=0), residuals[:, None], columns[:, None, :],
         forces[:, :, 0], forces, np.ones((1, 2), bool), np.zeros(1),
     )  # fmt: skip
-    return CandidateTests(chosen, np.array([2.0, 3.0]), regression, relative=0.2, odds=0.6)
+    return Candidates(CandidateTerms((), chosen), np.array([2.0, 3.0]), regression, forces, relative=0.2, odds=0.6)
 
 
 def by_brute_force(x, terms, y, noise, s, prior, probability):
@@ -63,7 +59,7 @@ def by_brute_force(x, terms, y, noise, s, prior, probability):
 @pytest.mark.parametrize("kinds", [("constant force", "quadratic drag"), ("Stribeck friction", "Stribeck friction")])
 def test_mixture_is_the_posterior_of_a_linear_gaussian_model(kinds, monkeypatch):
     x, terms, y, noise = line(np.random.default_rng(1))
-    monkeypatch.setattr(term_evidence, "batch_sums", np.zeros_like)  # white noise of a known size
+    monkeypatch.setattr(term_regression, "batch_sums", np.zeros_like)  # white noise of a known size
     tests = candidates_of_line(x, terms, y, noise, kinds)
     sets = tests.sets()
     weights = probabilities(sets)
@@ -201,7 +197,7 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     kept = []
 
     def recorded(candidates, *_):
-        kept.append(candidates.tests())
+        kept.append(candidates)
         return ()
 
     monkeypatch.setattr(method, "possible_terms", recorded)
@@ -216,7 +212,7 @@ def test_tests_agree_with_fits_that_have_the_term(monkeypatch):
     )
     full = dr.identify(wide, log, differentiate=True)
     tests = kept[0]
-    k = next(i for i, x in enumerate(tests.terms) if x.kind == "stiffness")
+    k = next(i for i, x in enumerate(tests.library.terms) if x.kind == "stiffness")
     estimate, variance = (x[k] for x in tests.regression.estimates())
     assert estimate == pytest.approx(full.parameters["stiffness"], abs=0.1 * full.standard_errors["stiffness"])
     assert np.sqrt(variance) == pytest.approx(full.standard_errors["stiffness"], rel=0.25)
@@ -248,7 +244,7 @@ def test_long_logs_are_tested_in_sections_with_the_same_answer(n_sections, monke
         n_terms = accelerations.shape[2]
         numbers = len(intervals) * term_regression._numbers(fit, n_terms)
         with monkeypatch.context() as small:
-            small.setattr(term_regression, "_MOST", 0.9 * numbers)
+            small.setattr(term_regression, "_NUMBERS", 0.9 * numbers)
             small.setattr(term_regression, "_SECTION", numbers / n_sections)
             found.append(whole(intervals, fit, result, accelerations, *more))
         return together
@@ -276,9 +272,9 @@ def test_terms_that_the_model_has_are_no_candidates(monkeypatch):
     from diransac.identification.methods.lo_diransac import method
 
     kept = []
-    monkeypatch.setattr(method, "possible_terms", lambda candidates, *_: kept.append(candidates.tests()) or ())
+    monkeypatch.setattr(method, "possible_terms", lambda candidates, *_: kept.append(candidates) or ())
     identified(cart_log(4))
-    kinds = {x.kind for x in kept[0].terms}
+    kinds = {x.kind for x in kept[0].library.terms}
     # A gain of the only input is one of all parameters: no motion separates them.
     assert not kinds & {"viscous friction", "input gain"}
     assert {"quadratic drag", "constant force", "stiffness"} <= kinds

@@ -10,10 +10,15 @@ import pytest
 
 import diransac as dr
 from command_line import run
-from diransac.identification.methods.lo_diransac.missing_terms import _drawn, connections
+from diransac.identification.methods.lo_diransac.missing_terms import Candidates, _drawn, connections
 from diransac.identification.methods.lo_diransac.motion_equations import inertia_slopes
-from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, TermRegression
-from diransac.identification.structure.candidate_terms import CandidateTerm, RelativeMotion, candidate_terms
+from diransac.identification.methods.lo_diransac.term_regression import TermRegression
+from diransac.identification.structure.candidate_terms import (
+    CandidateTerm,
+    CandidateTerms,
+    RelativeMotion,
+    candidate_terms,
+)
 from diransac.identification.structure.lacking_terms import INPUT_CHANGES, with_terms
 from user_models import tumbling
 
@@ -76,7 +81,8 @@ def candidates_tested(made, whitened=None, parameters=None, bounds=None, largest
         CandidateTerm(f"kind {k}", "q", "q", "", "", f"p{x}", "", ca.SX(1), bounds.get(k, (-np.inf, np.inf)))
         for k, x in enumerate(parameters)
     ]
-    return CandidateTests(tuple(terms), units_of(made, largest), whitened or regression(made))
+    library = CandidateTerms((), tuple(terms))
+    return Candidates(library, units_of(made, largest), whitened or regression(made), np.ones((len(made.force), 1, 1)))
 
 
 def select(made, *arguments, **options):

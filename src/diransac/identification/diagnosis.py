@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray, robust_std, runs
+from diransac.arrays import FloatArray, IntArray, long_runs, robust_std, runs
 from diransac.data.input_timing import InputTiming
 from diransac.identification.serialization import Masks, Number, Numbers, Series, Values, WholeNumbers
 
@@ -51,8 +51,8 @@ class Resolution:
         return f"inputs interpolated {how}" if how else ""
 
 
+# Series of a diagnosis with a value for each window.
 _BY_WINDOW = ("unmodelled_accelerations", "unmodelled_forces", "suggested_terms", "smoothed_states")
-"""Series of a diagnosis with a value for each window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +186,13 @@ class Diagnosis:
         return rows
 
 
+# Windows of the unmodelled accelerations over which their RMS is taken.
 _LENGTH = 8
-"""Windows of the unmodelled accelerations over which their RMS is taken."""
-
-
-_FEWEST = 5 * _LENGTH
+# RMS over the robust scale from which on the model does not hold.
+# Of the regimes of the robustness benchmark, saturated and wrong inputs alone exceed this multiple.
+_FAR = 6.0
+# The same RMS over that of the accelerations by the model, at least.
+_MATERIAL = 0.3
 
 
 @dataclass(frozen=True)
@@ -223,51 +225,27 @@ def departures(diagnosis: Diagnosis, log: int, unexplained: Mapping[str, float])
     """
     windows = diagnosis.windows_of(log)
     time = diagnosis.unmodelled_time[windows]
-    if len(windows) < _FEWEST:
-        return []
     departing, ratios = np.zeros(len(windows), bool), np.zeros(len(windows))
     for name, share in unexplained.items():
         values = diagnosis.unmodelled_accelerations[name][windows]
-        ratio = _ratio(values)
-        if share <= 0.0 or ratio is None:
+        moving = values[values != 0.0]  # which they are in gaps
+        if share <= 0.0 or len(moving) < 5 * _LENGTH or not (scale := float(robust_std(moving))):
             continue
-        scale = _scale(values)
+        rms = np.sqrt(_stretches(np.square(values)).mean(axis=1))
+        largest = _stretches(np.pad(rms, _LENGTH - 1)).max(axis=1)  # of the stretches that hold each window
         modelled = float(np.sqrt(np.mean(np.square(values)))) * (1.0 - share) / share
-        # Of the regimes of the robustness benchmark, saturated and wrong inputs alone exceed these multiples of the
-        # scale.  A stretch must be material beside the accelerations by the model, too.
-        far = (ratio > 6.0) & (ratio * scale > 0.3 * modelled)
-        departing |= far & (np.abs(values) > 3.0 * scale)
-        ratios = np.maximum(ratios, np.where(far, ratio, 0.0))
-    width = float(np.median(np.diff(time)))
+        far = (largest > _FAR * scale) & (largest > _MATERIAL * modelled)
+        departing |= far & (np.abs(values) > 0.5 * _FAR * scale)
+        ratios = np.maximum(ratios, np.where(far, largest / scale, 0.0))
+    # Stretches that are apart by less than their length are one.
+    departing = ~long_runs(np.pad(~departing, _LENGTH, constant_values=True), _LENGTH)[_LENGTH:-_LENGTH]
+    width = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     return [
         Departure(float(time[x.start] - width), float(time[x.stop - 1] + width), float(ratios[x].max()))
-        for x in _joined(departing)
+        for x in runs(departing)
     ]
 
 
-def _scale(values: FloatArray) -> float:
-    """Robust standard deviation about zero of the values that are not zero, as in gaps."""
-    moving = values[values != 0.0]
-    return float(robust_std(moving)) if len(moving) >= _FEWEST else 0.0
-
-
-def _ratio(values: FloatArray) -> FloatArray | None:
-    """Largest RMS ``(W,)`` of the stretches that hold each window, over the scale; None without a scale."""
-    scale = _scale(values)
-    if scale <= 0.0:
-        return None
-    total = np.cumsum(np.r_[0.0, np.square(values / scale)])
-    rms = np.sqrt((total[_LENGTH:] - total[:-_LENGTH]) / _LENGTH)
-    padded = np.pad(rms, _LENGTH - 1)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, _LENGTH).max(axis=1))
-
-
-def _joined(flags: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[slice]:
-    """Stretches of set flags; those apart by less than a stretch's length are one."""
-    found: list[slice] = []
-    for one in runs(flags):
-        if found and one.start - found[-1].stop < _LENGTH:
-            found[-1] = slice(found[-1].start, one.stop)
-        else:
-            found.append(one)
-    return found
+def _stretches(values: FloatArray) -> FloatArray:
+    """Values of all stretches of so many windows, (n, length)."""
+    return np.lib.stride_tricks.sliding_window_view(values, _LENGTH)

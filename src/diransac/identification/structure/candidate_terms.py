@@ -15,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement, count
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.identification.structure.lacking_terms import INPUT_GAIN, KINDS, Suggestion, name_of_term, unit_over
 from diransac.model import Model, expressions
@@ -114,15 +114,6 @@ class CandidateTerms:
     def __len__(self) -> int:
         return len(self.terms)
 
-    @cached_property
-    def _entries(self) -> tuple[ca.Function, IntArray, IntArray]:
-        """Function of the terms' structurally nonzero entries; equation and term of each."""
-        stacked = ca.sparsify(ca.horzcat(*(x.residuals for x in self.terms)))
-        rows, columns = stacked.sparsity().get_triplet()
-        nonzeros = ca.vertcat(*(stacked[i, j] for i, j in zip(rows, columns, strict=True)))
-        entries = ca.Function("entries", list(self.symbols), [nonzeros])
-        return entries, np.array(rows), np.array(columns)
-
     def means(self, motion: Sequence[FloatArray], weights: FloatArray, length: int) -> FloatArray:
         """Weighted means of every term over intervals of ``length`` rows.
 
@@ -138,16 +129,17 @@ class CandidateTerms:
         -------
         (N / length, n_v, n_terms) array
         """
-        entries, rows, columns = self._entries
-        n = len(weights) // length
-        found = np.zeros((n, self.terms[0].residuals.numel(), len(self)))
+        stacked = ca.sparsify(ca.horzcat(*(x.residuals for x in self.terms)))
+        rows, columns = (np.array(x) for x in stacked.sparsity().get_triplet())
+        nonzeros = ca.vertcat(*(stacked[i, j] for i, j in zip(rows.tolist(), columns.tolist(), strict=True)))
+        entries = ca.Function("entries", list(self.symbols), [nonzeros])
+        means: FloatArray = np.zeros((len(weights) // length, self.terms[0].residuals.numel(), len(self)))
         step, mapped = max(1, 256 // length), cache(entries.map)
-        for k in range(0, n, step):
+        for k in range(0, len(means), step):
             part = slice(k * length, (k + step) * length)
-            own = [x[part] for x in motion]
-            values = _in_every_row(mapped(len(own[0])), own) * weights[part, None]
-            found[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
-        return found
+            values = _in_every_row(mapped(len(weights[part])), [x[part] for x in motion]) * weights[part, None]
+            means[k : k + step, rows, columns] = values.reshape(-1, length, len(rows)).sum(axis=1)
+        return means
 
     def suggestion(
         self, k: int, value: float, error: float, explained: float, rivals: Sequence[int] = ()
@@ -189,13 +181,13 @@ class CandidateTerms:
 
 def _in_every_row(mapped: ca.Function, arrays: Sequence[FloatArray]) -> FloatArray:
     """Values (N, n) of a function of vectors over rows (N, n_i), by CasADi: these are too many terms to compile."""
-    inputs, found = [np.ascontiguousarray(x) for x in arrays], np.empty(mapped.size_out(0)[::-1])
+    inputs, values = [np.ascontiguousarray(x) for x in arrays], np.empty(mapped.size_out(0)[::-1])
     buffer, evaluate = mapped.buffer()
     for k, rows in enumerate(inputs):
         buffer.set_arg(k, rows.data)  # type: ignore[call-arg]  # a buffer has a size
-    buffer.set_res(0, found.data)  # type: ignore[call-arg]
+    buffer.set_res(0, values.data)  # type: ignore[call-arg]
     evaluate()
-    return found
+    return values
 
 
 def candidate_terms(
@@ -236,7 +228,7 @@ def candidate_terms(
     symbols = tuple(ca.SX.sym(n, size) for n, size in model.argument_sizes.items())
     maker = _Maker(model, symbols, speeds, inputs)
     terms = [x for i in range(model.n_v) for x in maker.of_equation(i)]
-    terms += [x for one in relative for x in maker.between(one)]
+    terms += [x for one in relative for x in maker.of_place(maker.place(one))]
     terms += maker.of_held()
     if library is not None:
         terms += maker.of_user(library)
@@ -245,12 +237,18 @@ def candidate_terms(
 
 @dataclass(frozen=True)
 class _Expression:
-    """An expression, as it is read, as code, and its unit; None if that is unknown."""
+    """An expression as it is read, its Python code, and its unit; None if that is unknown."""
 
-    value: ca.SX
     formula: str
     code: str
     unit: str | None
+
+    def power(self, n: int) -> _Expression:
+        """Its n-th power."""
+        formula, code = _single(self.formula), _single(self.code)
+        if n > 1:
+            formula, code = f"{formula}^{n}", f"{code} ** {n}"
+        return _Expression(formula, code, f"({self.unit})^{n}" if n > 1 else self.unit)
 
 
 @dataclass(frozen=True)
@@ -286,6 +284,12 @@ class _Maker:
     speeds: FloatArray
     inputs: FloatArray
 
+    @cached_property
+    def value(self) -> Callable[[str], ca.SX]:
+        """What a term's code computes from the model's signals; 1 without code."""
+        signals = {"ca": ca, **dict(zip("qvau", self.model.named(*self.symbols[:4]), strict=True))}
+        return cache(lambda code: ca.SX(eval(code or "1", signals)))
+
     def alone(self, i: int) -> _Place:
         """One velocity and its equation."""
         one = np.eye(self.model.n_v)[i]
@@ -294,93 +298,77 @@ class _Maker:
 
     def place(self, motion: RelativeMotion) -> _Place:
         """The place of the terms of a motion."""
-        model, (q, v, *_), names = self.model, self.symbols, self.model.rate_names
+        model, names = self.model, self.model.rate_names
         used = [names[k] for k in np.flatnonzero(motion.velocities)]
-        speed = _sum(motion.velocities, v, model.velocities, names, "v")
+        speed = _sum(motion.velocities, model.velocities, names, "v")
         position, unit = None, model.coordinates.get(used[0], "")
         if model.kinematics is None and used[0] in model.coordinates:
-            position = _sum(motion.velocities[: model.n_q], q, model.coordinates, names, "q")
-        return _Place(
-            (position or speed).formula if len(used) > 1 else used[0], "_".join(used), motion, speed, position, unit
-        )
+            position = _sum(motion.velocities[: model.n_q], model.coordinates, names, "q")
+        name = (position or speed).formula if len(used) > 1 else used[0]
+        return _Place(name, "_".join(used), motion, speed, position, unit)
 
     def of_equation(self, i: int) -> Iterator[CandidateTerm]:
         """Candidates in one equation, the simplest first."""
         place = self.alone(i)
-        yield from self.of_own_motion(place)
-        for k, (name, unit) in enumerate(self.model.coordinates.items()):
-            if place.position is not None and name == place.name:
-                yield from self._of_springs(place)
+        yield from self.of_place(place)
+        for name, unit in self.model.coordinates.items():
             if unit == "rad":
-                yield from self._of_angle(place, self.symbols[0][k], name)
+                yield from self._of_angle(place, name)
         yield from self._of_other_speeds(place)
 
-    def between(self, motion: RelativeMotion) -> Iterator[CandidateTerm]:
-        """Candidates that act between what a term of the model connects."""
-        place = self.place(motion)
-        yield from self.of_own_motion(place)
-        if place.position is not None:
-            yield from self._of_springs(place)
-
-    def of_own_motion(self, place: _Place) -> Iterator[CandidateTerm]:
-        """Friction and drag, or decay of states of first order, and a constant."""
+    def of_place(self, place: _Place) -> Iterator[CandidateTerm]:
+        """Friction and drag, or decay of states of first order, a constant, and springs."""
         first_order = self.model.rate_names[int(np.flatnonzero(place.motion.velocities)[0])] in self.model.first_order
         if first_order:
-            yield self._term("linear term", place, "linear", _power(place.speed, 1))
-            yield self._term("quadratic term", place, "quadratic", _power(place.speed, 2))
+            yield self._term("linear term", place, "linear", place.speed.power(1))
+            yield self._term("quadratic term", place, "quadratic", place.speed.power(2))
         elif place.motion.speed > 0.0:
             yield from self._of_speed(place)
-        one = _Expression(ca.SX(1), "", "", "")
-        yield self._term("constant term" if first_order else "constant force", place, "bias", one)
+        constant = _Expression("", "", "")
+        yield self._term("constant term" if first_order else "constant force", place, "bias", constant)
+        if place.position is not None:
+            for n, label in ((1, "stiffness"), (2, "quadratic_stiffness"), (3, "cubic_stiffness")):
+                yield self._term(label.replace("_", " "), place, label, place.position.power(n))
 
     def _of_speed(self, place: _Place) -> Iterator[CandidateTerm]:
-        v, speed = place.speed.value, place.speed
-        name, code, unit = speed.formula, speed.code, speed.unit
-        slow = float(f"{0.01 * place.motion.speed:.1g}")
-        sign, smooth = ca.tanh(v / slow), f"ca.tanh({_single(code)} / {slow:g})"
-        yield self._term("Coulomb friction", place, "coulomb", _Expression(sign, f"sign({name})", smooth, ""))
+        speed, unit, rms = place.speed, place.speed.unit, place.motion.speed
+        name, code, v, v_code = speed.formula, speed.code, _single(speed.formula), _single(speed.code)
+        sign = _Expression(f"sign({name})", f"ca.tanh({v_code} / {float(f'{0.01 * rms:.1g}'):g})", "")
+        yield self._term("Coulomb friction", place, "coulomb", sign)
         if np.count_nonzero(place.motion.velocities) == 1:
-            yield from self._of_load(place, _Expression(sign, f"sign({name})", smooth, ""))
-        yield self._term("viscous friction", place, "viscous", _power(speed, 1))
-        drag = f"|{name}| {_single(name)}", f"ca.fabs({code}) * {_single(code)}", f"({unit})^2"
-        yield self._term("quadratic drag", place, "quadratic", _Expression(ca.fabs(v) * v, *drag))
-        size = f"|{name}|", f"ca.fabs({code})", unit
-        yield self._term("asymmetric drag", place, "current", _Expression(ca.fabs(v), *size))
+            yield from self._of_load(place, sign)
+        yield self._term("viscous friction", place, "viscous", speed.power(1))
+        drag = _Expression(f"|{name}| {v}", f"ca.fabs({code}) * {v_code}", f"({unit})^2")
+        yield self._term("quadratic drag", place, "quadratic", drag)
+        yield self._term("asymmetric drag", place, "current", _Expression(f"|{name}|", f"ca.fabs({code})", unit))
         for factor in (0.03, 0.06, 0.12, 0.25):
-            slow = float(f"{factor * place.motion.speed:.2g}")
-            formula = f"sign({name}) exp(-({_single(name)} / {slow:g})^2)"
-            decay = f"{smooth} * ca.exp(-(({_single(code)} / {slow:g}) ** 2))"
-            value = sign * ca.exp(-((v / slow) ** 2))
-            yield self._term("Stribeck friction", place, "stribeck", _Expression(value, formula, decay, ""))
+            slow = f"{float(f'{factor * rms:.2g}'):g}"
+            formula = f"{sign.formula} exp(-({v} / {slow})^2)"
+            decay = _Expression(formula, f"{sign.code} * ca.exp(-(({v_code} / {slow}) ** 2))", "")
+            yield self._term("Stribeck friction", place, "stribeck", decay)
 
-    def _of_springs(self, place: _Place) -> Iterator[CandidateTerm]:
-        assert place.position is not None
-        for n, kind in ((1, ""), (2, "quadratic "), (3, "cubic ")):
-            label = f"{kind}stiffness".replace(" ", "_")
-            yield self._term(f"{kind}stiffness", place, label, _power(place.position, n))
-
-    def _of_angle(self, place: _Place, q: ca.SX, name: str) -> Iterator[CandidateTerm]:
-        for n in (1, 2, 3):
-            many, times = (f"{n} ", f"{n} * ") if n > 1 else ("", "")
+    def _of_angle(self, place: _Place, name: str) -> Iterator[CandidateTerm]:
+        for n, many, times, label in ((1, "", "", ""), (2, "2 ", "2 * ", "2"), (3, "3 ", "3 * ", "3")):
             kind = f"harmonic {n} of {name}" if n > 1 else f"gravity or first harmonic of {name}"
             for function in ("sin", "cos"):
-                value = getattr(ca, function)(n * q)
-                of_angle = _Expression(value, f"{function}({many}{name})", f"ca.{function}({times}q.{name})", "")
-                yield self._term(kind, place, f"{function}{n if n > 1 else ''}_{name}", of_angle)
+                harmonic = _Expression(f"{function}({many}{name})", f"ca.{function}({times}q.{name})", "")
+                yield self._term(kind, place, f"{function}{label}_{name}", harmonic)
 
     def _of_other_speeds(self, place: _Place) -> Iterator[CandidateTerm]:
-        v, signals, rates = self.symbols[1], list(self.model.velocities), self.model.rate_names
-        units, i = list(self.model.velocities.values()), rates.index(place.name)
-        speeds = [_Expression(v[j], signals[j], f"v.{rates[j]}", units[j]) for j in range(self.model.n_v)]
+        rates = self.model.rate_names
+        i = rates.index(place.name)
+        speeds = [
+            _Expression(signal, f"v.{rate}", unit)
+            for rate, (signal, unit) in zip(rates, self.model.velocities.items(), strict=True)
+        ]
         # What two coordinates dissipate together acts on both alike (Rayleigh).
         n_reciprocal = self.model.n_q if place.position is not None else 0
         for j, other in enumerate(speeds):
             if j > i or (j < i and j >= n_reciprocal):
                 back = [(j, float(place.motion.forces[i]), speeds[i])] if j < n_reciprocal else []
-                yield self._term(f"coupling to {signals[j]}", place, f"coupling_{rates[j]}", other, back)
-        for j, k in combinations_with_replacement(range(self.model.n_v), 2):
-            formula, code = f"{signals[j]} {signals[k]}", f"v.{rates[j]} * v.{rates[k]}"
-            product = _Expression(v[j] * v[k], formula, code, f"({units[j]}) ({units[k]})")
+                yield self._term(f"coupling to {other.formula}", place, f"coupling_{rates[j]}", other, back)
+        for (j, x), (k, y) in combinations_with_replacement(enumerate(speeds), 2):
+            product = _Expression(f"{x.formula} {y.formula}", f"{x.code} * {y.code}", f"({x.unit}) ({y.unit})")
             yield self._term("product of velocities", place, f"product_{rates[j]}_{rates[k]}", product)
 
     def of_held(self) -> Iterator[CandidateTerm]:
@@ -396,17 +384,12 @@ class _Maker:
         """Friction that is proportional to the force of the drives in the equation, as that of gears is."""
         u, i = self.symbols[3], int(np.flatnonzero(place.motion.velocities)[0])
         slopes = ca.jacobian(self.model.residual(*self.symbols)[i], u)
-        acting = slopes.sparsity().get_col()
-        if not acting or not slopes.is_constant():
-            return
-        names = [f"u.{list(self.model.inputs)[j]}" for j in acting]
-        factors = [float(slopes[0, j]) for j in acting]
-        load = " + ".join(f"{c!r} * {n}" for c, n in zip(factors, names, strict=True))
-        formula = f"|{names[0][2:] if len(names) == 1 else 'load'}| {sign.formula}"
-        value = ca.fabs(ca.dot(ca.DM(factors), ca.vertcat(*(u[j] for j in acting))))
-        friction = _Expression(value * sign.value, formula, f"ca.fabs({load}) * {sign.code}", "")
-        term = self._term("load-dependent friction", place, "load_friction", friction)
-        yield replace(term, unit="1")
+        acting, inputs = slopes.sparsity().get_col(), list(self.model.inputs)
+        if acting and slopes.is_constant():
+            load = " + ".join(f"{float(slopes[0, j])!r} * u.{inputs[j]}" for j in acting)
+            formula = f"|{inputs[acting[0]] if len(acting) == 1 else 'load'}| {sign.formula}"
+            friction = _Expression(formula, f"ca.fabs({load}) * {sign.code}", "")
+            yield replace(self._term("load-dependent friction", place, "load_friction", friction), unit="1")
 
     def of_user(self, library: TermLibrary) -> Iterator[CandidateTerm]:
         """The user's expressions in every equation."""
@@ -425,48 +408,42 @@ class _Maker:
             if not str(name).isidentifier():
                 raise ModelError(f"{label}: {name!r} cannot name a candidate term; use letters, digits and underscores")
             for i in range(self.model.n_v):
-                yield self._term(name, self.alone(i), name, _Expression(value, name, name, None))
+                yield self._term(name, self.alone(i), name, _Expression(name, name, None), value=value)
 
     def of_inputs(self) -> Iterator[CandidateTerm]:
         """Changes of each input, in every equation that it enters, the simplest first."""
-        q, v, a, u, p = self.symbols
-        r = self.model.residual(q, v, a, u, p)
+        r, u = self.model.residual(*self.symbols), self.symbols[3]
         for j, (name, unit) in enumerate(self.model.inputs.items()):
             slope = ca.jacobian(r, u[j])
-            for kind, label, formula, code, value, of_value, bounds in self._changes(name, u[j], unit, *self.inputs[j]):
-                parameter = self._free(f"{label}_{name}")
-                line = f"u.{name}" + (" * (1 + p.{0})" if kind == INPUT_GAIN else f" + p.{{0}}{code}").format(parameter)
-                h = ca.densify(slope * value)
-                called = KINDS[kind][0].format(x=name)
+            for kind, label, formula, code, of_value, bounds in self._changes(name, unit, *self.inputs[j].tolist()):
+                parameter, factor = self._free(f"{label}_{name}"), f" * {code}" if code else ""
+                line = f"u.{name} * (1 + p.{parameter})" if kind == INPUT_GAIN else f"u.{name} + p.{parameter}{factor}"
+                h, called = ca.densify(slope * self.value(code)), KINDS[kind][0].format(x=name)
                 yield CandidateTerm(kind, name, name, formula, line, parameter, of_value, h, bounds, called)
 
     def _changes(
-        self, name: str, u: ca.SX, unit: str, size: float, largest: float
-    ) -> Iterator[tuple[str, str, str, str, ca.SX, str, tuple[float, float]]]:
-        """Kind, label, formula, factor in code, value, and unit and bounds of the coefficient of changes of one input.
+        self, name: str, unit: str, size: float, largest: float
+    ) -> Iterator[tuple[str, str, str, str, str, tuple[float, float]]]:
+        """Kind, label, formula, code, and unit and bounds of the coefficient of changes of one input.
 
         Within the bounds, but for an error of half of the coefficient, what the actuator gives does not fall with its
         input; a dead band and saturation take from it.
         """
-        most = 1.5
-        yield INPUT_GAIN, "gain_error", name, "", u, "1", (-0.5, 0.5)
+        most, u = 1.5, f"u.{name}"
+        yield INPUT_GAIN, "gain_error", name, u, "1", (-0.5, 0.5)
         if not size > 0.0:
             return
-        code, per_unit = f"u.{name}", unit_over("1", "" if unit == "1" else unit)
-        yield "input offset", "offset", "", "", ca.SX(1), unit, (-np.inf, np.inf)
-        curve, least = f" * ca.fabs({code}) * {code}", -most / (2.0 * largest)
-        yield "curved input", "curvature", f"|{name}| {name}", curve, ca.fabs(u) * u, per_unit, (least, np.inf)
+        yield "input offset", "offset", "", "", unit, (-np.inf, np.inf)
+        per_unit, least = unit_over("1", "" if unit == "1" else unit), -most / (2.0 * largest)
+        yield "curved input", "curvature", f"|{name}| {name}", f"ca.fabs({u}) * {u}", per_unit, (least, np.inf)
         for factor in (0.02, 0.05, 0.1, 0.2, 0.4, 0.8):
             width = float(f"{factor * size:.2g}")
-            limited = f" * ca.fmax(-1, ca.fmin(1, {code} / {width:g}))"
-            value = ca.fmax(-1.0, ca.fmin(1.0, u / width))
-            formula = f"sign({name}) beyond {width:g}"
-            yield "dead band", "dead_band", formula, limited, value, unit, (-most * width, 0.0)
+            formula, limited = f"sign({name}) beyond {width:g}", f"ca.fmax(-1, ca.fmin(1, {u} / {width:g}))"
+            yield "dead band", "dead_band", formula, limited, unit, (-most * width, 0.0)
         for factor in (0.6, 0.8, 1.0, 1.3, 1.7):
-            level = float(f"{factor * size:.2g}")
-            beyond = f" * ({code} - ca.fmax(-{level:g}, ca.fmin({level:g}, {code})))"
-            value = u - ca.fmax(-level, ca.fmin(level, u))
-            yield "saturation", "saturation", f"({name} beyond {level:g})", beyond, value, "1", (-most, 0.0)
+            level = f"{float(f'{factor * size:.2g}'):g}"
+            beyond = f"({u} - ca.fmax(-{level}, ca.fmin({level}, {u})))"
+            yield "saturation", "saturation", f"({name} beyond {level})", beyond, "1", (-most, 0.0)
 
     def _term(
         self,
@@ -475,61 +452,43 @@ class _Maker:
         label: str,
         expression: _Expression,
         others: Sequence[tuple[int, float, _Expression]] = (),
+        value: ca.SX | None = None,
     ) -> CandidateTerm:
-        """A term at a place; it also acts in other equations, with a factor."""
+        """A term at a place, which has a value if its code has none; it also acts in other equations, with a factor."""
         forces, names, parameter = place.motion.forces, self.model.rate_names, self._free(f"{label}_{place.label}")
         known = self.model.kinematics is None and self.model.force_sign
         force = {"m": "N", "rad": "N m"}.get(place.unit, "") if known else ""
         parts = [*((k, float(forces[k]), expression) for k in np.flatnonzero(forces).tolist()), *others]
         residuals = ca.SX(self.model.n_v, 1)
         for k, factor, summand in parts:
-            residuals[k] = factor * summand.value
+            residuals[k] = factor * (self.value(summand.code) if value is None else value)
         (first, code), *also = ((names[k], _summand(factor, parameter, x)) for k, factor, x in parts)
+        unit = "" if expression.unit is None or not force else unit_over(force, expression.unit)
+        name = name_of_term(kind, place.name, expression.formula, place.unit)
         return CandidateTerm(
-            kind,
-            first,
-            place.name,
-            expression.formula,
-            code,
-            parameter,
-            "" if expression.unit is None or not force else unit_over(force, expression.unit),
-            residuals,
-            name=name_of_term(kind, place.name, expression.formula, place.unit),
-            also=dict(also),
+            kind, first, place.name, expression.formula, code, parameter, unit, residuals, name=name, also=dict(also)
         )
 
     def _free(self, name: str) -> str:
         """The name, or the next that no signal and no parameter has."""
-        model = self.model
-        taken = {*model.units, *model.parameters}
-        names = (name, *(f"{name}_{k}" for k in range(2, len(taken) + 3)))
-        return next(x for x in names if x not in taken)
+        taken = {*self.model.units, *self.model.parameters}
+        return next(x for x in chain([name], (f"{name}_{k}" for k in count(2))) if x not in taken)
 
 
-def _sum(
-    factors: FloatArray, values: ca.SX, signals: Mapping[str, str], names: Sequence[str], vector: str
-) -> _Expression:
+def _sum(factors: FloatArray, signals: Mapping[str, str], names: Sequence[str], vector: str) -> _Expression:
     """A weighted sum of signals; its unit is that of the first, whose factor is 1."""
     formula, code, used = "", "", np.flatnonzero(factors).tolist()
     for k in used:
-        sign = "" if k == used[0] else " - " if factors[k] < 0.0 else " + "
-        size = abs(float(factors[k]))
+        sign, size = "" if k == used[0] else " - " if factors[k] < 0.0 else " + ", abs(float(factors[k]))
         formula += f"{sign}{'' if size == 1.0 else f'{size:g} '}{list(signals)[k]}"
         code += f"{sign}{'' if size == 1.0 else f'{size!r} * '}{vector}.{names[k]}"
-    value = sum((float(factors[k]) * values[k] for k in used[1:]), values[used[0]])
-    return _Expression(value, formula, code, list(signals.values())[used[0]])
+    return _Expression(formula, code, list(signals.values())[used[0]])
 
 
 def _summand(factor: float, parameter: str, x: _Expression) -> str:
     """Code of a summand of a residual, with its sign."""
     size = "" if abs(factor) == 1.0 else f"{abs(factor)!r} * "
     return f"{'-' if factor < 0.0 else '+'} {size}p.{parameter}{f' * {x.code}' if x.code else ''}"
-
-
-def _power(x: _Expression, n: int) -> _Expression:
-    if n == 1:
-        return replace(x, formula=_single(x.formula), code=_single(x.code))
-    return _Expression(x.value**n, f"{_single(x.formula)}^{n}", f"{_single(x.code)} ** {n}", f"({x.unit})^{n}")
 
 
 def _single(text: str) -> str:

@@ -25,7 +25,8 @@ from diransac.arrays import FloatArray
 from diransac.identification.serialization import Number, Values
 from diransac.model import Model, Parameter, expressions
 
-INPUT_GAIN, _RICHER = "input gain", "richer motion of {place}"
+INPUT_GAIN = "input gain"
+_RICHER = "richer motion of {place}"
 INPUT_CHANGES = (INPUT_GAIN, "input offset", "curved input", "dead band", "saturation")
 """Kinds of the terms that change an input."""
 KINDS = {
@@ -130,10 +131,8 @@ class PossibleTerm:
     name: str = ""
 
     def __str__(self) -> str:
-        if self.name:
-            return f"{self.name} ({self.formula})" if self.formula and self.kind != INPUT_GAIN else self.name
-        formula = f", {self.formula}" if self.formula and self.kind != INPUT_GAIN else ""
-        return f"{self.kind} {'of' if self.kind in INPUT_CHANGES else 'on'} {self.place}{formula}"
+        name = self.name or f"{self.kind} {'of' if self.kind in INPUT_CHANGES else 'on'} {self.place}"
+        return f"{name} ({self.formula})" if self.formula and self.kind != INPUT_GAIN else name
 
     @property
     def motion(self) -> str:

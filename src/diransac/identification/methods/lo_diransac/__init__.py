@@ -21,7 +21,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | `motion_equations.py` | residuals and regressors on the motion |
 | `diagnosing.py`, `checks.py` | the diagnosis by name; findings of a fit on itself |
 | `parts.py`, `logs_alone.py` | parameters of parts of the logs, and of each log |
-| `missing_terms.py`, `term_regression.py`, `term_evidence.py` | terms that the model may lack, and their weights |
+| `missing_terms.py`, `term_regression.py` | terms that the model may lack, and their weights |
 | **comparison with other estimates** | |
 | `competition.py`, `sources.py` | estimates by other means, of which one is the answer |
 | `judge.py`, `forward.py`, `inverse.py` | their predictions of held-out blocks: of motion, and of forces |

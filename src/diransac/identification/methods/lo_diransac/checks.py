@@ -1,4 +1,4 @@
-"""Findings of a fit on itself: errors of sensors and of inputs, and parameters that change."""
+"""Findings of a fit on its recordings: errors of sensors and of inputs."""
 
 from __future__ import annotations
 
@@ -7,27 +7,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.identification.estimate import Disagreement
 from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
-    from diransac.arrays import FloatArray
     from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.local_search import Explanation
-    from diransac.identification.methods.lo_diransac.parts import Parts
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
 
 
-def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:
+def findings_of_fit(found: Explanation, acting: ActingInputs | None) -> Iterator[Finding]:
     """Findings for and against an estimate.
 
     Parameters
     ----------
     found : Explanation
-    parts : Parts
-        Result of `compared_parts`.
     acting : ActingInputs or None
         Inputs of an estimate that is none of the fit, and to which errors of recordings that the fit has do not apply.
 
@@ -47,7 +42,6 @@ def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | Non
                 yield Finding(
                     "note", f"{name} is recorded with white noise of {size} (RMS), which the estimate includes."
                 )
-    yield from _of_parts(found.intervals.layout.names, parts)
 
 
 def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
@@ -88,43 +82,3 @@ def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
 def _shifted(names: Sequence[str], delay: float) -> str:
     """The option that corrects a delay of signals."""
     return f"correct it where other programs read the log: --shift {','.join(f'{n}={-delay:.4g}' for n in names)}"
-
-
-def disagreements_of(names: Sequence[str], parts: Parts, parameters: FloatArray) -> Iterator[Disagreement]:
-    """Parameters that change during the log.
-
-    Parameters
-    ----------
-    names : sequence of str
-    parts : Parts
-        Result of `compared_parts`.
-    parameters : (n,) array
-        The answer.
-    """
-    for change in parts.changes:
-        k, first, second = change.index, number(change.first, 3), number(change.second, 3)
-        text = f"{names[k]} changes during the log, from {first} in its first half to {second} in its second"
-        half = change.halves[int(np.argmax(np.abs(change.halves[:, k] - parameters[k])))]
-        yield Disagreement(
-            f"{text}, as by a payload, a drifting gain or another regime",
-            "identify stretches of the log one by one, with --from and --until",
-            names[k],
-            dict(zip(names, half.tolist(), strict=True)),
-        )
-
-
-def _of_parts(names: Sequence[str], parts: Parts) -> Iterator[Finding]:
-    """Parts of the log that the others do not predict, or whose parameters scatter more than by noise."""
-    if parts.fail_elsewhere:
-        more = percent(np.sqrt(parts.held_out) - 1.0)
-        text = f"Fifths of the log that are held out have {more} more unmodelled force (RMS) than in the fit of all"
-        yield Finding("note", f"{text}, so that what is estimated from one part fails in another.")
-    found = parts.deviation
-    if found is not None:
-        where = f"most between {percent(found.begin)} and {percent(found.end)} of its duration"
-        text = (
-            f"Parts of the log disagree on the parameters {number(found.scatter, 2)} times as much as by noise, {where}"
-        )
-        effect = f"without that part {names[found.index]} changes by {percent(found.change)}"
-        claim = f"{text}, so that {effect}; intervals are too narrow, or the model lacks an effect"
-        yield Finding("care", claim, "look at that part, or leave it out with --leave-out")

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from diransac.identification.core.noise import Mixture
     from diransac.identification.core.windows import ShootingIntervals
 
-_OUTLIER = 0.5
-
 
 def diagnosis_of(
     dataset: Dataset,
@@ -47,7 +45,7 @@ def diagnosis_of(
     known = intervals.known
     seen = known.any(axis=0)
     sigma, fraction = (np.where(seen, x, np.nan) for x in (noise.sigma, noise.pi))
-    outliers = known & (noise.inlying(residuals, known) < _OUTLIER)
+    outliers = known & (noise.inlying(residuals, known) < 0.5)
     counted = outliers.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     fraction = np.where(noise.has_outliers, fraction, np.where(seen, counted, np.nan))
     shown = intervals.is_logged[intervals.starts]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray, size_or_one
 from diransac.identification.core.equations import linearize
 from diransac.identification.core.fit import weights_of
 from diransac.identification.regression.uncertainty import student_quantile
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
 
 # Fewest batches of correlated intervals.
 _BATCHES = 4
-_TINY, _UPPER, _NORMAL_UPPER = 1e-300, 0.975, 1.959963984540054
+# Level of the quantile by which sums of few batches count as sums of many.
+_LEVEL = 0.975
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,18 +44,7 @@ class EffectOfIntervals:
 
 
 def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfIntervals:
-    """Effect of each interval's measurements on the parameters of a fit.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        At its optimum.
-
-    Returns
-    -------
-    EffectOfIntervals
-    """
+    """Effect of each interval's measurements on the parameters of a fit at its optimum."""
     n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(np.zeros((len(intervals), k, n_p)), np.eye(n_s, n_p))
@@ -64,12 +55,11 @@ def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfInter
 
 
 def batch_sums(values: FloatArray, usual: int | None = None) -> FloatArray:
-    """Sums over neighbouring intervals: their squares count what neighbours have in common.
+    """Sums ``(n_batches, n)`` over neighbouring intervals, whose squares count what neighbours have in common.
 
     A batch has about sqrt(W) intervals, or as many as a first-order autoregression of a column asks for (Andrews 1991,
     Bartlett's kernel), but a quarter of them at most: a slow current pushes one way for a third of a log.  Sums are
-    increased by Student's t for their number, so that a normal interval has its level, and long ones by what an
-    estimate takes from so few.
+    scaled by Student's t for their number, so that 95 % intervals keep their level with few batches.
 
     Parameters
     ----------
@@ -77,10 +67,6 @@ def batch_sums(values: FloatArray, usual: int | None = None) -> FloatArray:
         Contributions of the intervals to the error of an estimate.
     usual : int, optional
         Number of rows of a batch, where these are sums over several intervals.
-
-    Returns
-    -------
-    (n_batches, n) array
     """
     usual = usual or round(np.sqrt(len(values)))
     sums = _sums_of_batches(values, usual)
@@ -88,19 +74,19 @@ def batch_sums(values: FloatArray, usual: int | None = None) -> FloatArray:
         if length > usual:
             few = _sums_of_batches(values[:, j], length)
             variance = np.square(few).sum() * len(few) / (len(few) - 1)
-            sums[:, j] *= np.sqrt(max(variance / (np.square(sums[:, j]).sum() + _TINY), 1.0))
+            sums[:, j] *= np.sqrt(max(variance / size_or_one(np.square(sums[:, j]).sum()), 1.0))
     return sums
 
 
 def _sums_of_batches(values: FloatArray, length: int) -> FloatArray:
     """Sums over ``length`` intervals each, increased for their number."""
     sums = np.add.reduceat(values, np.arange(0, len(values), length), axis=0)
-    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _UPPER) / _NORMAL_UPPER)
+    return np.asarray(sums * student_quantile(max(len(sums) - 1, 1), _LEVEL) / NormalDist().inv_cdf(_LEVEL))
 
 
 def _correlated(values: FloatArray) -> IntArray:
     """Intervals ``(n,)`` that a batch of each column takes by its correlation with the next interval."""
-    power = np.square(values).sum(axis=0) + _TINY
+    power = size_or_one(np.square(values).sum(axis=0))
     rho = np.clip((values[1:] * values[:-1]).sum(axis=0) / power, 0.0, 1.0 - 1.0 / len(values))
     alpha = np.square(2.0 * rho / ((1.0 - rho) * (1.0 + rho)))
     wanted = np.ceil(1.1447 * np.cbrt(alpha * len(values)))

@@ -22,7 +22,7 @@ from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.checks import disagreements_of, findings_of_fit
+from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
 from diransac.identification.methods.lo_diransac.input_noise import with_accelerations
@@ -242,22 +242,20 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
             moved = with_accelerations(intervals, refined.fit, result)
             candidates = candidates_of_fit(*moved, settings.candidate_terms)
             lacks = None if likeliest.exact else missing_terms(candidates)
-    ambiguity = np.zeros((len(result.parameters),) * 2)
+    ambiguity = np.diag(parts.variances)
     if lacks is not None:
-        ambiguity += np.outer(lacks.change, lacks.change)
-    for one in parts.changes:
-        ambiguity[one.index, one.index] += one.variance
+        ambiguity = ambiguity + np.outer(lacks.change, lacks.change)
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
         *_checks_of_unmeasured(dataset, best),
-        *findings_of_fit(likeliest, parts, best.decided.acting if best.decided else None),
+        *findings_of_fit(likeliest, best.decided.acting if best.decided else None),
+        *parts.findings,
     )
-    disagree = tuple(disagreements_of(dataset.layout.names, parts, result.parameters))
     found = _Found(dataset, best, result, ambiguity, candidates, lacks)
     end = "converged" if refined.converged else "limit of steps"
     end = end if likeliest.complete else TIME_LIMIT
-    return replace(_estimate(settings, found, end, checks), disagreements=disagree)
+    return replace(_estimate(settings, found, end, checks), disagreements=parts.disagreements)
 
 
 def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:

@@ -1,8 +1,9 @@
-"""Parameters of parts of the logs, compared with each other: of halves and tenths of their time, and of every log.
+"""Parameters of parts of the logs, compared with each other: findings where they differ by more than chance.
 
-Parts are compared without another fit.  Where the model is not exact, parameters are projected again from a part of the
-intervals, and the others are predicted with them.  Where it is exact, each interval has a contribution to the
-parameters and an information, so that those of a part follow from sums: Cochran's test of homogeneity.
+Parts are compared without another fit.  Where the model is not exact, parameters are projected again from halves and
+fifths of the intervals, and the other intervals are predicted with them.  Where it is exact, each interval has a
+contribution to the parameters and an information, so that those of tenths follow from sums: Cochran's test of
+homogeneity.
 
 References
 ----------
@@ -13,16 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import FloatArray, IntArray, size_or_one
 from diransac.identification.core.equations import variances_of_intervals
 from diransac.identification.core.fit import weights_of
+from diransac.identification.estimate import Disagreement
+from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
 from diransac.identification.methods.lo_diransac.projection import least_squares_gains, means_of_windows
+from diransac.identification.methods.lo_diransac.term_regression import ROUNDING
+from diransac.text_table import number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
@@ -30,151 +36,93 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 
-# A difference of parameters: so many standard errors, and this part of the parameter.
-_CLEAR, _DIFFERENT = 4.0, 0.03
-# Parts of the logs that are predicted by the rest; mean square of what the model leaves of them, over what it is for
-# parameters that do not change, from which on it is no chance; standard errors by which the parameter that changed most
-# differs then, and probability that any of the others differs as much by chance.
-_HELD_OUT, _WORSE, _LIKELY, _UNLIKELY = 5, 1.25, 2.0, 0.05
-# Parts whose parameters an exact model must have in common; normal deviation of a difference that is no chance, of a
-# probability of 1e-4; part of a parameter that is negligible; information about a direction of the parameters, over the
-# largest, that is rounding.
-_STRETCHES, _BY_CHANCE, _NEGLIGIBLE, _ROUNDING = 10, 3.72, 2e-4, 1e-9
-# Residual of an equation over that of the worst, at least.
-_SMALLEST = 1e-6
-_TINY = 1e-300
-# Intervals of half the logs from which parameters and their scatter are estimated, at least.
-_FEWEST_INTERVALS = 9
+# Windows of half the logs from which parameters and their scatter are estimated, at least.
+_FEWEST = 9
+# Standard errors of a difference of halves that is no chance, by itself.
+_CLEAR = 4.0
+# Probability of a difference by chance, where held-out parts show that parameters change.
+_UNLIKELY = 0.05
+# Difference of halves over the parameter, at least.
+_DIFFERENT = 0.03
+# Parts that are predicted by the others.
+_FIFTHS = 5
+# Mean square of what the model leaves of held-out parts over its expectation, from which on parameters change.
+_WORSE = 1.25
+# Parts whose parameters an exact model must have in common.
+_TENTHS = 10
+# Normal deviation of a scatter that is no chance, of a probability of 1e-4.
+_BY_CHANCE = 3.72
+# Relative change of a parameter without a part that is no matter.
+_NEGLIGIBLE = 2e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """A parameter that differs between the halves of the logs: a payload, a battery, a machine that wears.
-
-    Parameters
-    ----------
-    index : int
-        Of the parameter.
-    halves : (2, n) array
-        All parameters of each half.
-    """
-
-    index: int
-    halves: FloatArray
-
-    @property
-    def first(self) -> float:
-        """Its value in the first half, its unit."""
-        return float(self.halves[0, self.index])
-
-    @property
-    def second(self) -> float:
-        """Its value in the second half, its unit."""
-        return float(self.halves[1, self.index])
-
-    @property
-    def apart(self) -> float:
-        """Difference over the mean of both."""
-        return abs(self.first - self.second) / max(0.5 * (abs(self.first) + abs(self.second)), _TINY)
-
-    @property
-    def variance(self) -> float:
-        """Variance over the log of a parameter that changes uniformly, with these means over its halves."""
-        return (self.first - self.second) ** 2 / 3.0
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """The part of the logs that agrees least with the others, where the model is exact.
-
-    Parameters
-    ----------
-    begin, end : float
-        The part, over the duration of each log.
-    scatter : float
-        Scatter of the parameters of all parts, over that by noise (RMS).
-    index : int
-        Parameter that changes most, over its value, if this part is left out.
-    change : float
-        That change.
-    """
-
-    begin: float
-    end: float
-    scatter: float
-    index: int
-    change: float
-
-
-@dataclass(frozen=True)
 class Parts:
-    """Parameters that are estimated again from parts of the logs.
+    """Parameters of parts of the logs.
 
     Parameters
     ----------
-    changes : sequence of Change, optional
-        Parameters that clearly differ between the halves; none where the model is exact.
-    held_out : float, optional
-        Mean square of what the model leaves of fifths of the logs whose parameters are those of the rest, over that of
-        the fit, and over what this is on average for parameters that do not change.
-    deviation : Deviation, optional
-        Of the part that deviates most from an exact model, if parts differ by more than noise explains.
+    variances : (n,) array
+        Variances of parameters that change during the logs, as if uniformly; 0 for the others.
+    findings : tuple of Finding, optional
+        Of parts that the others do not predict, or whose parameters scatter more than by noise.
+    disagreements : tuple of Disagreement, optional
+        Parameters that change during the logs.
     """
 
-    changes: Sequence[Change] = ()
-    held_out: float = 1.0
-    deviation: Deviation | None = None
-
-    @property
-    def fail_elsewhere(self) -> bool:
-        """True if parameters of some parts predict others clearly worse than chance allows."""
-        return self.held_out > _WORSE
+    variances: FloatArray
+    findings: tuple[Finding, ...] = ()
+    disagreements: tuple[Disagreement, ...] = ()
 
 
 def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
-    """Parameters of parts of the logs, compared with each other.
-
-    Parameters
-    ----------
-    found : Explanation
-    result : ProjectedEstimate
-
-    Returns
-    -------
-    Parts
-    """
+    """Parameters of parts of the logs, compared with each other: halves and fifths, or tenths if the model is exact."""
     intervals, fit = found.intervals, found.refinement.fit
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     share = place / np.bincount(intervals.log_of)[intervals.log_of]
     if found.exact:
-        return _deviating(intervals, fit, result, share)
-    return _changing(intervals, fit, result, share)
+        deviation = _deviation(intervals, fit, result, (_TENTHS * share).astype(int))
+        return Parts(np.zeros(len(result.parameters)), deviation)
+    return _changing(intervals, fit, result, share[result.windows])
 
 
 def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
     """Halves and held-out fifths of the logs, where the model is not exact."""
-    share = share[result.windows]
-    first = share < 0.5
-    if min(first.sum(), (~first).sum()) < _FEWEST_INTERVALS:
-        return Parts()
-    equations = _equations(intervals, fit, result)
-    held_out = _held_out(*equations, (_HELD_OUT * share).astype(int))
-    moved, apart = _of_halves(*equations, first)
+    names, first, n = intervals.layout.names, share < 0.5, len(result.parameters)
+    if min(first.sum(), (~first).sum()) < _FEWEST:
+        return Parts(np.zeros(n))
+    W, residuals = _equations(intervals, fit, result)
+    (before, of_first), (after, of_second) = (_change(W[half], residuals[half]) for half in (first, ~first))
+    apart = np.abs(after - before) / np.sqrt(size_or_one(of_first + of_second))
     apart[np.isinf(np.diag(result.covariance))] = 0.0
-    changed = np.abs(apart) > _clear(apart, held_out)
-    halves = result.parameters + moved
-    both = [Change(int(k), halves) for k in np.flatnonzero(changed)]
-    return Parts([x for x in both if x.apart > _DIFFERENT], held_out)
+    least, findings = np.full(n, _CLEAR), tuple[Finding, ...]()
+    worse = _held_out(W, residuals, (_FIFTHS * share).astype(int))
+    if worse > _WORSE:
+        # Some parameter has changed: the clearest one is likely, any other that would not differ so by chance.
+        tested = np.where(apart == apart.max(), 1, n)
+        least = np.minimum([NormalDist().inv_cdf(1.0 - 0.5 * _UNLIKELY / m) for m in tested.tolist()], _CLEAR)
+        text = f"Fifths of the log that are held out have {percent(np.sqrt(worse) - 1.0)} more unmodelled force (RMS)"
+        text = f"{text} than in the fit of all, so that what is estimated from one part fails in another."
+        findings = (Finding("note", text),)
+    halves = result.parameters + np.array([before, after])
+    difference, size = halves[1] - halves[0], 0.5 * np.abs(halves).sum(axis=0)
+    changed = (apart > least) & (np.abs(difference) > _DIFFERENT * size)
+    disagreements = tuple(_disagreement(names, halves, result.parameters, k) for k in np.flatnonzero(changed).tolist())
+    # Of a parameter that changes uniformly, with these means over its halves.
+    return Parts(np.where(changed, np.square(difference) / 3.0, 0.0), findings, disagreements)
 
 
-def _clear(apart: FloatArray, held_out: float) -> FloatArray:
-    """Standard errors ``(n,)`` beyond which a difference of parameters, so many standard errors, is no chance."""
-    if held_out <= _WORSE:
-        return np.full(len(apart), _CLEAR)
-    from statistics import NormalDist
-
-    of_any = NormalDist().inv_cdf(1.0 - 0.5 * _UNLIKELY / len(apart))
-    return np.where(np.abs(apart) == np.abs(apart).max(), _LIKELY, min(of_any, _CLEAR))
+def _disagreement(names: Sequence[str], halves: FloatArray, parameters: FloatArray, k: int) -> Disagreement:
+    """The k-th parameter changes, as do the parameters of both halves ``(2, n)``."""
+    first, second = (number(x, 3) for x in halves[:, k].tolist())
+    text = f"{names[k]} changes during the log, from {first} in its first half to {second} in its second"
+    half = halves[int(np.argmax(np.abs(halves[:, k] - parameters[k])))]
+    return Disagreement(
+        f"{text}, as by a payload, a drifting gain or another regime",
+        "identify stretches of the log one by one, with --from and --until",
+        names[k],
+        dict(zip(names, half.tolist(), strict=True)),
+    )
 
 
 def _equations(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> tuple[FloatArray, FloatArray]:
@@ -185,12 +133,6 @@ def _equations(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate
     return means_of_windows(W, result.windows), means_of_windows(residuals, result.windows)
 
 
-def _of_halves(W: FloatArray, residuals: FloatArray, first: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Changes (2, n) of the parameters in the first and the second half; their difference (n,), in standard errors."""
-    moved, variances = zip(*(_change(W[half], residuals[half]) for half in (first, ~first)), strict=True)
-    return np.array(moved), (moved[1] - moved[0]) / np.sqrt(np.maximum(np.sum(variances, axis=0), _TINY))
-
-
 def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     """Mean square of the residuals of each part with the parameters of the others, over that with those of all.
 
@@ -198,44 +140,47 @@ def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     that of a part ``1 + n/N'``, with N' residuals of the others.  The ratio of these two counts as 1.
     """
     scale = _scales(residuals)
-    fitted = residuals + W @ _change(W, residuals)[0]
-    left = np.zeros_like(residuals)
+    fitted, left = residuals + W @ _change(W, residuals)[0], np.zeros_like(residuals)
     for k in np.unique(part):
         held = part == k
         left[held] = residuals[held] + W[held] @ _change(W[~held], residuals[~held])[0]
-    taken = _n_estimated(W) / residuals.size
-    usual = (1.0 + taken * _HELD_OUT / (_HELD_OUT - 1.0)) / max(1.0 - taken, _TINY)
-    return float(np.square(left / scale).sum() / max(np.square(fitted / scale).sum() * usual, _TINY))
+    usual = (1.0 + (1.0 - _free(W)) * _FIFTHS / (_FIFTHS - 1.0)) / _free(W)
+    return float(np.square(left / scale).sum() / size_or_one(np.square(fitted / scale).sum() * usual))
 
 
-def _deviating(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
-    """Tenths of the logs, where the model is exact; no deviation if all agree, or if its effect is negligible.
+def _deviation(
+    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, part: IntArray
+) -> tuple[Finding, ...]:
+    """The part that agrees least with the others, where the model is exact; none if all agree, or if it is no matter.
 
     The measurements of part k change the parameters by ``u_k``, of variance ``V_k`` if the model is exact and the noise
     white.  ``sum u_k V_k^-1 u_k`` then has a chi-squared distribution.
     """
-    n, part = len(result.parameters), (_STRETCHES * share).astype(int)
+    names, n = intervals.layout.names, len(result.parameters)
     effect = effect_of_intervals(intervals, fit)
     variances = variances_of_intervals(intervals, fit, weights_of(intervals, fit), effect.z, effect.s)
-    unit = np.sqrt(np.diag(effect.covariance)) + _TINY
     if not (np.isfinite(variances).all() and np.isfinite(effect.steps).all()):  # LAPACK would raise
-        return Parts()
-    u = np.array([effect.steps[part == k].sum(axis=0) for k in range(_STRETCHES)]) / unit
-    V = np.array([variances[part == k].sum(axis=0) for k in range(_STRETCHES)]) / np.outer(unit, unit)
-    sizes, axes = np.linalg.eigh(V)
-    informed = sizes > _ROUNDING * sizes[:, -1:]
-    along = np.einsum("kij,ki->kj", axes, u)
-    distances = np.divide(np.square(along), sizes, out=np.zeros_like(sizes), where=informed).sum(axis=1)
-    freedom = int(informed.sum()) - n
+        return ()
+    unit = size_or_one(np.sqrt(np.diag(effect.covariance)))
+    u = np.array([effect.steps[part == k].sum(axis=0) for k in range(_TENTHS)]) / unit
+    V = np.array([variances[part == k].sum(axis=0) for k in range(_TENTHS)]) / np.outer(unit, unit)
+    information = np.linalg.pinv(V, ROUNDING, hermitian=True)
+    distances = np.einsum("ki,kij,kj->k", u, information, u)
+    freedom = round(np.einsum("kij,kji->", information, V)) - n
     if freedom < 1 or not _is_no_chance(float(distances.sum()), freedom):
-        return Parts()
+        return ()
     k, scatter = int(np.argmax(distances)), float(np.sqrt(distances.sum() / freedom))
     R = effect.covariance / np.outer(unit, unit)
     without = R @ np.linalg.lstsq(R - V[k], -u[k], rcond=None)[0]
-    changes = np.abs(without) * unit / np.maximum(np.abs(result.parameters), _TINY)
-    worst, edges = int(np.argmax(changes)), (k / _STRETCHES, (k + 1) / _STRETCHES)
-    most = Deviation(*edges, scatter, worst, float(changes[worst]))
-    return Parts(deviation=most if most.change > _NEGLIGIBLE else None)
+    changes = np.abs(without) * unit / size_or_one(np.abs(result.parameters))
+    worst = int(np.argmax(changes))
+    if changes[worst] <= _NEGLIGIBLE:
+        return ()
+    text = f"Parts of the log disagree on the parameters {number(scatter, 2)} times as much as by noise"
+    where = f"most between {percent(k / _TENTHS)} and {percent((k + 1) / _TENTHS)} of its duration"
+    effects = f"without that part {names[worst]} changes by {percent(float(changes[worst]))}"
+    claim = f"{text}, {where}, so that {effects}; intervals are too narrow, or the model lacks an effect"
+    return (Finding("care", claim, "look at that part, or leave it out with --leave-out"),)
 
 
 def _is_no_chance(distance: float, freedom: int) -> bool:
@@ -245,23 +190,20 @@ def _is_no_chance(distance: float, freedom: int) -> bool:
 
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them.
-
-    What is left of N residuals is too small by what n parameters have taken of them, ``1 - n/N`` on average.
-    """
+    """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
     gains = least_squares_gains(W, 1.0 / _scales(residuals))
     change = -np.einsum("pwi,wi->p", gains, residuals)
-    left = residuals + W @ change
-    sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
-    return change, np.square(sums).sum(axis=0) / max(1.0 - _n_estimated(W) / residuals.size, _TINY)
+    sums = batch_sums(np.einsum("pwi,wi->wp", gains, residuals + W @ change))
+    return change, np.square(sums).sum(axis=0) / _free(W)
 
 
-def _n_estimated(W: FloatArray) -> int:
-    """Number of parameters that have a part in the regressors."""
-    return int(W.any(axis=(0, 1)).sum())
+def _free(W: FloatArray) -> float:
+    """Fraction of the mean square of N residuals that n fitted parameters leave on average, ``1 - n / N``."""
+    n_rows = W.shape[0] * W.shape[1]
+    return float(max(1.0 - W.any(axis=(0, 1)).sum() / n_rows, 1.0 / n_rows))
 
 
 def _scales(residuals: FloatArray) -> FloatArray:
     """Size ``(n_v,)`` of the residuals of each equation."""
     scale = np.sqrt(np.square(residuals).mean(axis=0))
-    return np.asarray(np.maximum(scale, _SMALLEST * scale.max() + _TINY))
+    return size_or_one(np.maximum(scale, np.sqrt(ROUNDING) * scale.max()))

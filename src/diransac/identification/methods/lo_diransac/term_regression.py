@@ -1,14 +1,23 @@
-"""The regression of a fit's residuals on candidate terms, with all else that is estimated beside them.
+"""The regression of what a fit leaves on terms that its model lacks, with all else that is estimated beside them.
 
-A term accelerates the model, as the unmodelled accelerations do, so that its slopes are in the normal equations.  One
-solution of these for all terms gives the residuals' slopes by the coefficients.  Long logs are solved section by
-section, and a batch of neighbouring intervals is kept as the triangle of its residuals, which takes a fraction of the
-memory.
+A term accelerates the model by a known function of the motion, as the unmodelled accelerations do: its slopes are
+theirs, times that function.  One solution of the normal equations for all terms gives what each changes in the states,
+the parameters and the unmodelled accelerations, and so in every residual: of the measurements, of continuity, and of
+the unmodelled accelerations from their prior.  Long logs are solved section by section, and a batch of neighbouring
+intervals is kept as the triangle of its residuals, which takes a fraction of the memory.
+
+Estimates of single terms are those of a score test (`core`).  The residuals themselves are needed beside them:
+their products scatter from interval to interval as unmodelled forces do, which no score of the measurements alone
+shows, and terms are tested beside others that have been selected.
+
+References
+----------
+Frisch, Waugh 1933 (regression on what other columns leave).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import chain, pairwise
@@ -16,11 +25,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, size_or_one
 from diransac.identification.core.equations import linearize
 from diransac.identification.core.fit import innovation_std, weights_of
 from diransac.identification.core.theta import of_logs, sum_of_products
-from diransac.identification.methods.lo_diransac.term_evidence import TermRegression
+from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 
 if TYPE_CHECKING:
     from diransac.identification.core.equations import NormalEquations
@@ -29,12 +38,127 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.simulation import GaussNewtonBatch
 
-# Numbers of equations that are solved at once (80 MB, a tenth of a second), at most; of a section of more.
-_MOST, _SECTION = 1e7, 3e5
-# Factor of the prior of discrepancies that holds them at zero.
+ROUNDING = 1e-12
+"""Part of an information, or of a squared size, that is rounding."""
+
+# Numbers of the equations that are solved at once, at most: 80 MB, a tenth of a second.
+_NUMBERS = 1e7
+# Numbers of a section of more.
+_SECTION = 3e5
+# Factor of the prior of discrepancies, which stand for the forces of terms, that holds them at zero.
 _HELD = 1e-3
-# Part of the information of an interval that is rounding.
-_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TermRegression:
+    """Residuals of a fit as linear functions of the coefficients of K effects, all else estimated with them.
+
+    Parameters
+    ----------
+    effects : (n, K) array
+        Change of the parameters per unit of each coefficient.
+    direct : (K,) array
+        Information of each coefficient, if all else were known.
+    residuals : (G, m) array
+        Of each interval, or of each group of neighbouring ones, over their standard deviations.
+    columns : (G, m, K) array
+        Their derivatives with respect to the coefficients.
+    force : (W, e) array
+        Unmodelled force in each equation, mean of each interval.
+    forces : (W, e, K) array
+        Its derivatives.
+    acts : (e, K) bool array
+        Equations in which each effect acts.
+    inertia : (n,) array
+        Slopes of the logarithm of the inertia by the parameters.
+    batch : int, optional
+        Rows of a batch of correlated ones, as in `batch_sums`.
+    """
+
+    effects: FloatArray
+    direct: FloatArray
+    residuals: FloatArray
+    columns: FloatArray
+    force: FloatArray
+    forces: FloatArray
+    acts: BoolArray
+    inertia: FloatArray
+    batch: int | None = None
+
+    def estimates(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance ``(K,)`` of each coefficient alone; 0 and infinite where the log determines none."""
+        by_interval = np.einsum("wmk,wmk->wk", self.columns, self.columns)
+        scores = np.einsum("wmk,wm->wk", self.columns, self.residuals)
+        information = by_interval.sum(axis=0)
+        determined = information > ROUNDING * self.direct
+        information = np.where(determined, information, 1.0)
+        values = np.where(determined, -scores.sum(axis=0) / information, 0.0)
+        scatter = np.square(batch_sums(scores + by_interval * values, self.batch)).sum(axis=0)
+        return values, np.where(determined, np.maximum(information, scatter) / np.square(information), np.inf)
+
+    def of(self, some: Sequence[int]) -> TermRegression:
+        """The regression on some of the effects."""
+        return replace(
+            self,
+            effects=self.effects[:, some],
+            direct=self.direct[some],
+            columns=self.columns[:, :, some],
+            forces=self.forces[:, :, some],
+            acts=self.acts[:, some],
+        )
+
+    def beside(self, *chosen: int) -> TermRegression:
+        """The regression with the chosen effects among all else that is estimated."""
+        if not chosen:
+            return self
+        k, *others = chosen
+        own, (value, shares) = self.columns[:, :, k], self._along(k)
+        regression = replace(
+            self,
+            effects=self.effects - self.effects[:, k, None] * shares,
+            residuals=self.residuals + own * value,
+            columns=self.columns - own[:, :, None] * shares,
+            force=self.force + self.forces[:, :, k] * value,
+            forces=self.forces - self.forces[:, :, k, None] * shares,
+        )
+        return regression.beside(*others)
+
+    def divisor(self, changes: FloatArray) -> FloatArray:
+        """Divisor, 1 or more, of coefficients and of the changes ``(n, ...)`` of the parameters with them.
+
+        Accelerations are linear in forces over the inertia, and in its inverse.  Where a term makes the inertia
+        smaller, the forces are smaller with it.
+        """
+        return np.maximum(1.0 - np.tensordot(self.inertia, changes, 1), 1.0)
+
+    def together(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Estimates ``(c,)`` of the chosen coefficients, each beside the others, and their covariance."""
+        columns = self.columns[:, :, list(chosen)]
+        covariance = np.linalg.inv(np.einsum("wmk,wml->kl", columns, columns))
+        values = -covariance @ np.einsum("wmk,wm->k", columns, self.residuals)
+        errors = np.einsum("wmk,wm->wk", columns, self.residuals + columns @ values) @ covariance
+        wider = np.sqrt(np.maximum(np.square(batch_sums(errors, self.batch)).sum(axis=0) / np.diag(covariance), 1.0))
+        return values, covariance * np.outer(wider, wider)
+
+    def joint(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Coefficients ``(c,)`` of the chosen effects, each beside the others, and their standard errors."""
+        values, covariance = self.together(chosen)
+        divisor = self.divisor(self.effects[:, list(chosen)] @ values)
+        return values / divisor, np.sqrt(np.diag(covariance)) / divisor
+
+    def explained(self, k: int) -> float:
+        """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts."""
+        acts, (value, _) = self.acts[:, k], self._along(k)
+        before, after = (
+            np.square(x[:, acts]).sum(axis=0) for x in (self.force, self.force + self.forces[:, :, k] * value)
+        )
+        return float(1.0 - (after / size_or_one(before)).mean())
+
+    def _along(self, k: int) -> tuple[float, FloatArray]:
+        """The coefficient of effect k alone, and coefficients ``(K,)`` of the others' columns on its column."""
+        own = self.columns[:, :, k]
+        along = own / size_or_one(np.square(own).sum())
+        return -float((along * self.residuals).sum()), np.einsum("wm,wmk->k", along, self.columns)
 
 
 def parts_of_intervals(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> int:
@@ -42,14 +166,8 @@ def parts_of_intervals(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> 
 
     Terms change with each reversal, within intervals over which the unmodelled acceleration is constant: a mean would
     count a friction that reverses as one that is small.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    n_terms : int
     """
-    most = _MOST / (len(intervals) * _numbers(fit, n_terms))
+    most = _NUMBERS / (len(intervals) * _numbers(fit, n_terms))
     return max(x for x in range(1, intervals.length + 1) if intervals.length % x == 0 and (x == 1 or x < most))
 
 
@@ -212,7 +330,7 @@ class _Pushed:
 
 def _sections(n_intervals: int, parts: int, numbers: float) -> list[slice]:
     """All intervals, if their numbers are few; otherwise sections of whole intervals."""
-    if n_intervals * numbers <= _MOST:
+    if n_intervals * numbers <= _NUMBERS:
         return [slice(0, n_intervals)]
     length = parts * max(int(_SECTION / (parts * numbers)), 1)
     return [slice(k, min(k + length, n_intervals)) for k in range(0, n_intervals, length)]
@@ -257,10 +375,9 @@ def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArra
     As many rows as there are unknowns, or measurements, ``most``, say all of the measurements: a square root of their
     information H (W, n, n), and residuals that have their gradient.
     """
-    size = np.sqrt(np.einsum("wii->wi", H))
-    size[size == 0.0] = 1.0
+    size = size_or_one(np.sqrt(np.einsum("wii->wi", H)))
     values, vectors = (x[..., -most:] for x in np.linalg.eigh(H / (size[:, :, None] * size[:, None, :])))
-    known = values > _ROUNDING * values[:, -1:]
+    known = values > ROUNDING * values[:, -1:]
     root = np.sqrt(np.where(known, values, 0.0))
     slopes = np.ascontiguousarray((vectors * size[:, :, None] * root[:, None, :]).swapaxes(1, 2))
     return slopes, np.einsum("wji,wj->wi", vectors, gradient / size) / np.where(known, root, np.inf)
