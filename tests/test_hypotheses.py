@@ -57,13 +57,13 @@ def test_sample_k_depends_on_seed_and_k_alone():
 
 
 def test_random_sets_have_as_many_rows_of_each_equation_and_up_to_the_largest_sample():
-    rows, settings = noisy_rows(0), dr.LoDiransac(n_samples=300, largest_sample=3)
+    rows, settings = noisy_rows(0), dr.LoDiransac(n_samples=300)
     every, *sets = random_sets(settings, rows, 0)
     counts = np.array([one.sum(axis=0) for one in sets])
     assert every.all()
     np.testing.assert_array_equal(counts[:, 0], counts[:, 1])
-    assert (counts.min(), counts.max()) == (5, 15)
+    assert (counts.min(), counts.max()) == (5, 20)
     assert not np.array_equal(sets[0][:, 0], sets[0][:, 1])
-    # Each row is drawn as often as chance has it: a mean of 300 samples of 10 of 400 rows, within 6 standard errors.
+    # Each row is drawn as often as chance has it: a mean of 300 samples of 12.5 of 400 rows, within 6 standard errors.
     share = np.mean(sets, axis=(0, 2))
-    assert np.abs(share - 10 / 400).max() < 6.0 * np.sqrt(10 / 400 / 600)
+    assert np.abs(share - 12.5 / 400).max() < 6.0 * np.sqrt(12.5 / 400 / 600)

@@ -31,8 +31,13 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.regression.estimators import BoundEstimator
+    from diransac.model import Model
 
 _OVERLAP = 5
+_N_SCREENED = 12
+"""Intervals on which all hypotheses are scored, and hypotheses that are scored on all intervals."""
+_LARGEST_SAMPLE = 4
+"""Rows of each equation in the largest sample, over the number of parameters."""
 # Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
 _NUMBERS_AT_A_TIME = 1_000_000
 # Least residual of an equation over its terms: smoothing is not exact.
@@ -82,7 +87,7 @@ def _linear(
     """
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
-    few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
+    few = np.unique(np.linspace(0, n - 1, min(_N_SCREENED, n)).astype(int))
     samples = weak.solve_sized(random_sets(settings, weak, seed), layout)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
@@ -94,7 +99,18 @@ def _linear(
     if not len(samples):
         return samples
     order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
-    return samples[order[: settings.n_finalists]]
+    return samples[order[:_N_SCREENED]]
+
+
+def n_samples(settings: LoDiransacSettings, model: Model) -> int:
+    """Number of random samples, of which nonlinear least squares has half as many.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    model : Model
+    """
+    return settings.n_samples // 2 if model.nonlinear_parameters else settings.n_samples
 
 
 def _in_sensors_alone(dataset: Dataset) -> BoolArray:
@@ -108,10 +124,9 @@ def _nonlinear(
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     bound = _of_smoothed_motion(intervals, motion, dataset)
-    n, n_p, largest = bound.n_rows, intervals.n_p, settings.largest_sample
-    k = np.arange(settings.n_nonlinear_samples)
-    rows = sample_rows(seed, k, n, 0, min(n, largest * n_p))
-    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p, largest), strict=True)]
+    n, n_p, k = bound.n_rows, intervals.n_p, np.arange(n_samples(settings, intervals.model))
+    rows = sample_rows(seed, k, n, 0, min(n, _LARGEST_SAMPLE * n_p))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p), strict=True)]
     return bound.select([np.arange(n), *samples]).fit()
 
 
@@ -208,7 +223,7 @@ def _connected(W: FloatArray) -> BoolArray:
 
 
 def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters.
+    """All rows, and random sets of n to 4 n rows of each equation, with n parameters.
 
     Parameters
     ----------
@@ -223,9 +238,9 @@ def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> Bool
     """
     n, r, n_p = weak.W.shape
     k = np.arange(settings.n_samples)
-    sizes = _sizes(seed, k, n, n_p, settings.largest_sample)
+    sizes = _sizes(seed, k, n, n_p)
     draws = r * k[:, None] + np.arange(r)
-    most = min(settings.largest_sample * n_p, n)
+    most = min(_LARGEST_SAMPLE * n_p, n)
     rows = sample_rows(seed, draws.ravel(), n, 0, most).reshape(len(k), r, most)
     inside = np.broadcast_to(np.arange(rows.shape[2]) < sizes[:, None, None], rows.shape)
     sample, equation, _ = np.nonzero(inside)
@@ -235,9 +250,9 @@ def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> Bool
     return chosen
 
 
-def _sizes(seed: int, k: IntArray, n: int, n_p: int, largest: int) -> IntArray:
-    """Number of rows of samples k: n_p to ``largest`` n_p, of n rows; keys from the end are no sample's."""
-    drawn = sample_rows(seed, ~k.astype(np.uint64), (largest - 1) * n_p + 1, 0, 1)[:, 0]
+def _sizes(seed: int, k: IntArray, n: int, n_p: int) -> IntArray:
+    """Number of rows of samples k: n_p to 4 n_p, of n rows; keys from the end are no sample's."""
+    drawn = sample_rows(seed, ~k.astype(np.uint64), (_LARGEST_SAMPLE - 1) * n_p + 1, 0, 1)[:, 0]
     return np.asarray(np.minimum(n_p + drawn, n))
 
 

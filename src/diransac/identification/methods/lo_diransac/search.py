@@ -255,19 +255,18 @@ def searched(
         )
     search = LocalSearch(settings, motion, able, prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, rival=rival)
-    return Searched(motion, notes, len(hypotheses), likeliest, *parameters_of(settings, likeliest))
+    return Searched(motion, notes, len(hypotheses), likeliest, *parameters_of(likeliest))
 
 
-def parameters_of(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
+def parameters_of(likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
     """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these.
 
     Parameters
     ----------
-    settings : LoDiransacSettings
     likeliest : Explanation
     """
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
-    if likeliest.exact or not settings.projection:
+    if likeliest.exact:
         return fitted_parameters(intervals, fit), ()
     result, layout = estimate_parameters(intervals, fit), intervals.layout
     impossible = layout.violations(result.parameters)
