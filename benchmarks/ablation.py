@@ -90,7 +90,7 @@ def _parts() -> dict[str, Part]:
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
         ),
         "screening": Part(replace(DEFAULT, stuck_rows=False)),
-        "robust loss of the projection": Part(patches=(("projection._REWEIGHTED", 0),)),
+        "robust loss of the projection": Part(patches=(("projection.CAUCHY", None),)),
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
         "least squares": _without_source("least squares"),
         "simulation error": _without_source("simulation error"),

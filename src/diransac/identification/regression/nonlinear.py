@@ -31,7 +31,7 @@ from diransac.identification.regression.estimators import (
     solve_definite,
 )
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.rows import MotionRows, NullSpace, Solution, null_space, regression
+from diransac.identification.regression.rows import MotionRows, NullSpace, RowsSolution, null_space, regression
 from diransac.identification.regression.uncertainty import rows_without, score_inflation
 from diransac.model import Model, Parameter
 from diransac.simulation.compiler import Map
@@ -76,7 +76,7 @@ class NonlinearLeastSquares:
         return BoundNonlinear(self, dataset)
 
 
-def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows]) -> Solution | None:
+def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows]) -> RowsSolution | None:
     """Nonlinear least squares of rows of motions, as `solved` for affine models; None where no row is finite.
 
     Parameters
@@ -87,7 +87,7 @@ def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[Motio
 
     Returns
     -------
-    Solution or None
+    RowsSolution or None
     """
     names = (model.coordinates, model.velocities, model.accelerations, model.inputs)
     try:
@@ -101,7 +101,7 @@ def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[Motio
     except (DiransacError, np.linalg.LinAlgError):
         return None
     nothing = NullSpace(np.zeros((0, len(layout))), np.ones(len(layout)))
-    return Solution(bound.of_all_rows, np.zeros(len(layout)), bound.median_errors(), nothing, has_known_terms=True)
+    return RowsSolution(bound.of_all_rows, np.zeros(len(layout)), bound.median_errors(), nothing, has_known_terms=True)
 
 
 class BoundNonlinear:

@@ -13,20 +13,20 @@ Torr, Zisserman 2000.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, row_blocks
+from diransac.identification.core.rows import Rows, inclusive_bounds, solve, solve_sized
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, ParameterLayout
+    from diransac.data.dataset import Dataset
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
@@ -42,8 +42,6 @@ _LARGEST_SAMPLE = 4
 _NUMBERS_AT_A_TIME = 1_000_000
 # Least residual of an equation over its terms: smoothing is not exact.
 _SMALL_RESIDUAL = 0.01
-# Known terms that are as small beside those of another equation are rounding errors.
-_ROUNDING = 1e-9
 
 
 def find_hypotheses(
@@ -88,7 +86,8 @@ def _linear(
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
     few = np.unique(np.linspace(0, n - 1, min(_N_SCREENED, n)).astype(int))
-    samples = weak.solve_sized(random_sets(settings, weak, seed), layout)
+    prior = layout.prior_mean, layout.prior_std
+    samples = solve_sized(weak, random_sets(settings, weak, seed), prior)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
@@ -146,89 +145,13 @@ def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: D
     return NonlinearLeastSquares().bind(replace(dataset, segments=segments))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class WeakForm:
-    """Averaged rows of ``W p = b``.
-
-    Parameters
-    ----------
-    W : (n, r, n_p) array
-    b : (n, r) array
-        Of the equations, then of the sensors.
-    """
-
-    W: FloatArray
-    b: FloatArray
-
-    @cached_property
-    def has_known_terms(self) -> BoolArray:
-        """Mask ``(r,)`` of the equations in which b is more than a rounding error beside that of another one."""
-        largest = np.abs(self.b).max(axis=0)
-        return np.asarray(largest > _ROUNDING * largest.max())
-
-    def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
-        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
-
-        Rows have residuals of order one; the priors of a layout are further rows.
-        """
-        return _solved(*self._normal_equations(chosen, layout))
-
-    def solve_sized(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
-        """Parameters as by `solve`, which noise in equations without a known term (``b = 0``) does not shrink.
-
-        Zeros solve such an equation, too: it determines ratios of the parameters that it connects.  Given the ratios,
-        the size of each group of connected parameters is that of least squares of the other equations.
-        """
-        p, known = self.solve(chosen, layout), self.has_known_terms
-        if known.all() or not known.any():
-            return p
-        sized = WeakForm(np.ascontiguousarray(self.W[:, known]), self.b[:, known])
-        G, h = sized._normal_equations(chosen[:, :, known], layout)
-        ratios = p[:, :, None] * _connected(self.W[:, ~known])
-        transposed = ratios.swapaxes(1, 2)
-        sizes = _solved(transposed @ G @ ratios, (transposed @ h[:, :, None])[:, :, 0])
-        return np.asarray((ratios @ sizes[:, :, None])[:, :, 0])
-
-    def _normal_equations(self, chosen: BoolArray, layout: ParameterLayout | None) -> tuple[FloatArray, FloatArray]:
-        """Sums ``(n_sets, n_p, n_p)`` and ``(n_sets, n_p)`` over sets of rows."""
-        n, r, n_p = self.W.shape
-        products = np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)
-        known = (self.W * self.b[:, :, None]).reshape(n * r, -1)
-        G, h = np.empty((len(chosen), n_p, n_p)), np.empty((len(chosen), n_p))
-        at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
-        for first in range(0, len(chosen), at_a_time):
-            some = slice(first, first + at_a_time)
-            masks = chosen[some].reshape(-1, n * r).astype(np.float64)
-            G[some], h[some] = (masks @ products).reshape(-1, n_p, n_p), masks @ known
-        if layout is not None:
-            precision = 1.0 / np.square(layout.prior_std)
-            G, h = G + np.diag(precision), h + precision * layout.prior_mean
-        return G, h
-
-
-def _solved(G: FloatArray, h: FloatArray) -> FloatArray:
-    """Solutions ``(n_sets, n)`` of normal equations; 0 for an unknown that no row has."""
-    d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
-    G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(G.shape[-1])
-    return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
-
-
-def _connected(W: FloatArray) -> BoolArray:
-    """Mask ``(n_p, n_groups)`` of the parameters that some equations ``(n, r, n_p)`` connect; others are alone."""
-    used = W.any(axis=0).astype(int)
-    joined = (used.T @ used > 0) | np.eye(used.shape[1], dtype=bool)
-    for _ in range(used.shape[1].bit_length()):
-        joined = joined.astype(int) @ joined > 0
-    return np.asarray(np.unique(joined, axis=0).T)
-
-
-def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
+def random_sets(settings: LoDiransacSettings, weak: Rows, seed: int) -> BoolArray:
     """All rows, and random sets of n to 4 n rows of each equation, with n parameters.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    weak : WeakForm
+    weak : Rows
     seed : int
         Set k depends on the seed and k alone.
 
@@ -256,7 +179,7 @@ def _sizes(seed: int, k: IntArray, n: int, n_p: int) -> IntArray:
     return np.asarray(np.minimum(n_p + drawn, n))
 
 
-def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
+def weak_form(intervals: ShootingIntervals, motion: Motion) -> Rows:
     """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each.
 
     Parameters
@@ -267,7 +190,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
 
     Returns
     -------
-    WeakForm
+    Rows
     """
     model, H, layout = intervals.model, intervals.length, intervals.layout
     n_p = model.n_p
@@ -288,7 +211,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         means = np.concatenate([windows[firsts[k]] @ bump for k in row_blocks(len(firsts), at_a_time)])
         Ws.append(layout.scattered(means[:, : n_p * r].reshape(-1, n_p, r).swapaxes(1, 2), i))
         bs.append(means[:, n_p * r :])
-    return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
+    return _scaled(Rows(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
 
 
 def bump_of(n_rows: int) -> FloatArray:
@@ -317,12 +240,12 @@ def firsts_of(intervals: ShootingIntervals, rows: slice) -> IntArray:
     return np.asarray(rows.start + firsts[gaps[firsts + H] == gaps[firsts]])
 
 
-def _scaled(weak: WeakForm, n_v: int) -> WeakForm:
+def _scaled(weak: Rows, n_v: int) -> Rows:
     """The rows in units of the scales of the n_v equations, and of the sensors after them."""
-    scale = equation_scales(WeakForm(weak.W[:, :n_v], weak.b[:, :n_v]))
+    scale = equation_scales(Rows(weak.W[:, :n_v], weak.b[:, :n_v]))
     sensors = [_sensor_scale(weak.W[:, k], weak.b[:, k]) for k in range(n_v, weak.b.shape[1])]
     scale = np.concatenate([scale, sensors])
-    return WeakForm(weak.W / scale[:, None], weak.b / scale)
+    return weak.over(scale)
 
 
 def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
@@ -331,20 +254,20 @@ def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
     if not used.any():
         return 1.0
     W, b = W[used], b[used]
-    terms = W * np.linalg.lstsq(W, b, rcond=None)[0]
+    terms = W * solve(Rows(W[:, None], b[:, None])).p
     size = np.median(np.sqrt(np.square(terms).sum(axis=1) + np.square(b)))
     return float(max(np.median(np.abs(terms.sum(axis=1) - b)), _SMALL_RESIDUAL * size)) or 1.0
 
 
-def equation_scales(rows: WeakForm) -> FloatArray:
+def equation_scales(rows: Rows) -> FloatArray:
     """Scale of each equation: the median of its residuals, and a hundredth of its terms at least.
 
-    Sizes of the terms of equations without a known term (``b = 0``) are those of `WeakForm.solve_sized`: parameters
+    Sizes of the terms of equations without a known term (``b = 0``) are those of `solve_sized`: parameters
     that such an equation shrinks would shrink its scale, and a smaller scale the parameters.
 
     Parameters
     ----------
-    rows : WeakForm
+    rows : Rows
         Rows in the units of the equations.
 
     Returns
@@ -357,7 +280,7 @@ def equation_scales(rows: WeakForm) -> FloatArray:
     scale = np.where(scale > 0.0, scale, np.abs(rows.b).max(axis=0)) * rows.has_known_terms
     for residuals in (False, False, False, True, True):
         scale = np.where(scale > 0.0, scale, np.inf)
-        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve_sized(everything)[0]
+        terms = rows.W * solve_sized(rows.over(scale), everything)[0]
         scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(rows.b)))
         if residuals:
             scale = np.maximum(_median_size(terms.sum(axis=2) - rows.b), _SMALL_RESIDUAL * scale)
@@ -370,9 +293,7 @@ def _median_size(values: FloatArray) -> FloatArray:
 
 def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
     """Hypotheses clipped to inclusive bounds, without those that violate a strict one."""
-    bounds = intervals.layout.bounds
-    lower = np.array([-np.inf if x.positive else x.lower for x in bounds])
-    p = np.clip(p, lower, np.array([x.upper for x in bounds]))
+    p = np.clip(p, *inclusive_bounds(intervals.layout.bounds))
     return p[intervals.layout.admits(p)]
 
 

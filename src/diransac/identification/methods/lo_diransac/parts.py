@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.core.rows import Rows, solve
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
 from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals, weights_of
-from diransac.identification.methods.lo_diransac.projection import least_squares_gains, means_of_windows
+from diransac.identification.methods.lo_diransac.projection import means_of_windows
 
 if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.local_search import Explanation
@@ -248,11 +249,9 @@ def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArra
 
     What is left of N residuals is too small by what n parameters have taken of them, ``1 - n/N`` on average.
     """
-    gains = least_squares_gains(W, 1.0 / _scales(residuals))
-    change = -np.einsum("pwi,wi->p", gains, residuals)
-    left = residuals + W @ change
-    sums = batch_sums(np.einsum("pwi,wi->wp", gains, left))
-    return change, np.square(sums).sum(axis=0) / max(1.0 - _n_estimated(W) / residuals.size, _TINY)
+    solution = solve(Rows(W, -residuals), 1.0 / _scales(residuals))
+    sums = batch_sums(np.einsum("pwi,wi->wp", solution.gains, solution.rows.residuals(solution.p)))
+    return solution.p, np.square(sums).sum(axis=0) / max(1.0 - _n_estimated(W) / residuals.size, _TINY)
 
 
 def _n_estimated(W: FloatArray) -> int:
