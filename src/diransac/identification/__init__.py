@@ -11,6 +11,7 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `result.py`, `result_text.py`, `result_files.py` | `Result`; as text; as files |
 | `serialization.py` | JSON of dataclasses by their annotations |
 | `regression/` | parameters from rows of equations |
+| `core/` | rows of equations, and their one solver |
 | `structure/` | what a model and a log determine; terms that a model may lack |
 | `evaluation/` | an estimate against its logs; findings |
 | `prediction/` | open-loop prediction of logs |

@@ -34,14 +34,15 @@ if TYPE_CHECKING:
     from diransac.model import Model
 
 _OVERLAP = 5
+"""Averages that overlap at a row."""
 _N_SCREENED = 12
 """Intervals on which all hypotheses are scored, and hypotheses that are scored on all intervals."""
 _LARGEST_SAMPLE = 4
 """Rows of each equation in the largest sample, over the number of parameters."""
-# Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
 _NUMBERS_AT_A_TIME = 1_000_000
-# Least residual of an equation over its terms: smoothing is not exact.
+"""Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs."""
 _SMALL_RESIDUAL = 0.01
+"""Least residual of an equation over its terms: smoothing is not exact."""
 
 
 def find_hypotheses(
