@@ -1,6 +1,6 @@
 """Ablation of lo-diransac: what each part contributes, on real records, regimes, further machines, and a flight.
 
-``python benchmarks/ablation.py [--parts projection,"least squares+simulation error"] [--seeds 1000:1001]
+``python benchmarks/ablation.py [--parts observers,"least squares+simulation error"] [--seeds 1000:1001]
 [--records emps,go2-RL] [--out rows.jsonl] [--table FILE]``
 
 Every run is repeated without one part at a time, or without several that `+` joins: by a setting where there is one,
@@ -80,7 +80,7 @@ def _parts() -> dict[str, Part]:
     off = {"input_delay": False, "input_lag": False, "sensor_delays": (), "sensor_biases": (), "gain_drifts": ()}
     return {
         "nothing": Part(),
-        "random samples": Part(replace(DEFAULT, n_samples=0, n_nonlinear_samples=1)),
+        "random samples": Part(replace(DEFAULT, n_samples=0)),
         "outlier component of the noise": Part(replace(DEFAULT, outliers=False)),
         "unmodelled accelerations": Part(replace(DEFAULT, model_error=False)),
         "input gain and bias discrepancy": Part(replace(DEFAULT, prior_discrepancy=1e-6)),
@@ -90,9 +90,7 @@ def _parts() -> dict[str, Part]:
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
         ),
         "screening": Part(replace(DEFAULT, stuck_rows=False)),
-        "spikes of inputs": Part(patches=(("search.find_spikes", lambda s, i, m, h, *_: (i, h, 0)),)),
-        "projection": Part(replace(DEFAULT, projection=False)),
-        "robust loss of the projection": Part(patches=(("projection._REWEIGHTED", 0),)),
+        "robust loss of the projection": Part(patches=(("projection.CAUCHY", None),)),
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
         "least squares": _without_source("least squares"),
         "simulation error": _without_source("simulation error"),

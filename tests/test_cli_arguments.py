@@ -105,7 +105,7 @@ def test_a_misspelt_setting_is_answered_with_the_nearest_alone(folder: Path, typ
     done = run("identify", "swim.csv", "--set", f"{typed}=3", *MODEL)
     assert (done.exit_code, done.stdout) == (2, "")
     assert f'no setting "{typed}"; did you mean {meant}?' in " ".join(done.stderr.split())
-    assert "largest_sample" not in done.stderr
+    assert "smoothing_half_width" not in done.stderr
 
 
 def test_a_method_s_own_setting_is_used_and_reported(folder: Path):

@@ -310,13 +310,12 @@ def test_without_outliers_in_the_noise_no_sample_is_an_outlier():
 
 LEFT_OUT = [
     {"n_samples": 0},
-    {"max_steps": 0, "projection": False},
+    {"max_steps": 0},
     {"outliers": False},
     {"model_error": False},
     {"prior_model_error": 1e-5},
     {"prior_discrepancy": 1e-6},
     {"input_delay": False, "input_lag": False},
-    {"projection": False},
     {"stuck_rows": False},
     {"prior_model_error": 0.0},
     {"prior_discrepancy": 0.0},

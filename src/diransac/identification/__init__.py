@@ -12,6 +12,7 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `serialization.py` | JSON of dataclasses by their annotations |
 | `core/` | the estimator: windows, unknowns, equations, the one loop |
 | `regression/` | parameters from rows of equations |
+| `core/` | rows of equations, and their one solver |
 | `structure/` | what a model and a log determine; terms that a model may lack |
 | `evaluation/` | an estimate against its logs; findings |
 | `methods/` | the methods |

@@ -1,5 +1,6 @@
 """The estimator: windows of logs, their unknowns, and the one loop that fits them.
 
+- `rows`: the equations ``W p = b`` of any averaging, and their one solver.
 - `windows`: logs as windows, each a rollout of its own; inputs as they act; the augmented model.
 - `theta`: the vector of shared unknowns, with bounds, priors and places of each log; errors of recordings in it.
 - `noise`: mixture of a Gaussian and outliers of each signal.

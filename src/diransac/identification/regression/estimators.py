@@ -13,6 +13,7 @@ With known sigma this is the exact posterior mean of the linear-Gaussian model (
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,11 +27,12 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import NullSpace, null_space, regression
-from diransac.identification.regression.uncertainty import score_inflation
+from diransac.identification.regression.uncertainty import rows_without, score_inflation
 
 MIN_EIGENVALUE = 1e-6
-# Noise of a fit with priors at least, over the RMS of b.
+"""Eigenvalue of the information of a well-defined set of rows, in columns of unit RMS."""
 _LEAST_NOISE = 1e-5
+"""Noise of a fit with priors at least, over the RMS of b."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,37 +51,61 @@ class Selection:
     fit: Callable[[], FloatArray]
 
 
-class BoundEstimator(Protocol):
-    """An estimator over the usable rows of a dataset, which are numbered from 0, log after log."""
+class BoundEstimator(ABC):
+    """An estimator over the usable rows of a dataset, which are numbered from 0, log after log.
 
-    n_rows: int
+    Parameters
+    ----------
+    n_rows : int
+    scale : (n,) array
+        Size of each column of the information.
+    min_eigenvalue : float
+        Of the information of a well-defined set of rows.
+    prior_std : (n,) array
+        Standard deviation of each prior, its parameter's unit; infinite without one.
+    """
+
+    def __init__(self, n_rows: int, scale: FloatArray, min_eigenvalue: float, prior_std: FloatArray) -> None:
+        self.n_rows, self.scale, self._min_eigenvalue = n_rows, scale, min_eigenvalue
+        self._shifts = np.diag(np.where(np.isfinite(prior_std), prior_std, 0.0))[np.isfinite(prior_std)]
+        # Each prior is a row of unit size where the rank of rows is tested.
+        self._counted = np.diag(np.isfinite(prior_std).astype(float))
+
+    @abstractmethod
+    def information(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """Sums ``(n_sets, n, n)`` of ``W^T W`` in columns over their ``scale``."""
+
+    @abstractmethod
+    def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
+        """Parameters ``(n_sets, n)``; the means of priors may be shifted ``(n,)``."""
 
     def select(self, row_sets: Sequence[IntArray]) -> Selection:
         """Sets of rows, to be checked and fitted."""
+        return Selection(partial(self._well_defined, self.information(row_sets)), partial(self.fit, row_sets))
 
-    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        """Parameters from rows without each of several groups.
+    def _well_defined(self, information: FloatArray) -> BoolArray:
+        return np.asarray(smallest_eigenvalue(information + self._counted) > self._min_eigenvalue)
 
-        Parameters
-        ----------
-        groups : sequence of int array
-            Rows that are left out, one group at a time.
-        rows : (n_rows,) int array
-            Ascending.
-
-        Returns
-        -------
-        (n_groups, n) array
-        """
-
-    def prior_shifts(self, rows: IntArray) -> FloatArray:
-        """Change ``(n_priors, n)`` of the parameters from rows by a shift of each prior by its standard deviation."""
+    def _of_everything(self) -> FloatArray:
+        """Information ``(n, n)`` of the whole dataset, with priors as rows of unit size."""
+        return np.asarray(self.information([np.arange(self.n_rows)])[0] + self._counted)
 
     def null_space(self) -> NullSpace:
         """Directions of the parameters that the whole dataset does not determine."""
+        return null_space(self._of_everything(), self.scale, self._min_eigenvalue)
 
     def correlations(self) -> FloatArray:
         """Correlations ``(n, n)`` of the parameters' errors from the whole dataset, which determines them."""
+        return correlations(self._of_everything())
+
+    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
+        """Parameters ``(n_groups, n)`` from rows, which ascend, without each of several groups."""
+        return self.fit([rows_without(rows, group) for group in groups])
+
+    def prior_shifts(self, rows: IntArray) -> FloatArray:
+        """Change ``(n_priors, n)`` of the parameters from rows by a shift of each prior by its standard deviation."""
+        shifted = [self.fit([rows], shift)[0] for shift in self._shifts]
+        return np.array(shifted).reshape(-1, len(self.scale)) - self.fit([rows])
 
 
 class Estimator(Protocol):
@@ -226,82 +252,67 @@ def _solved(A: FloatArray, g: FloatArray, prior: _PriorSums | None) -> FloatArra
     return solve_definite(A + prior.weight[..., None] * np.eye(A.shape[-1]), g + prior.weight * prior.mean)
 
 
-class BoundSums:
+class BoundSums(BoundEstimator):
     """Blocks of ``[W b]^T [W b]`` in columns of unit RMS, the upper triangle of each observation's in a row.
 
-    The RMS of each column, 1 of one that is zero, is its ``scale``.
+    The RMS of each column is 1 of one that is zero.
     """
 
     def __init__(
         self, estimator: _SumsEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout | None = None
     ) -> None:
         self._estimator = estimator
-        self.n_rows, self._n_equations, self._n_p = W.shape
+        n_rows, self._n_equations, self._n_p = W.shape
         columns = np.concatenate([W, b[:, :, None]], axis=2)
-        self.scale = size_or_one(np.sqrt(np.square(columns.reshape(-1, self._n_p + 1)).mean(axis=0)))
-        columns = columns / self.scale
+        scale = size_or_one(np.sqrt(np.square(columns.reshape(-1, self._n_p + 1)).mean(axis=0)))
+        columns = columns / scale
         self._upper = np.triu_indices(self._n_p + 1)
         i, j = self._upper
-        self._blocks = np.zeros((self.n_rows, len(i)))
+        self._blocks = np.zeros((n_rows, len(i)))
         for row in range(W.shape[1]):
             self._blocks += columns[:, row, i] * columns[:, row, j]
-        per_unit = self.scale[:-1] / self.scale[-1]
-        self._prior_std = np.full(self._n_p, np.inf) if layout is None else layout.prior_std * per_unit
-        self._prior_mean = np.zeros(self._n_p) if layout is None else layout.prior_mean * per_unit
-        self._has_prior = np.isfinite(self._prior_std)
+        self.known_scale, self._per_unit = scale[-1], scale[:-1] / scale[-1]
+        std = np.full(self._n_p, np.inf) if layout is None else layout.prior_std
+        self._prior_std = std * self._per_unit
+        self._prior_mean = np.zeros(self._n_p) if layout is None else layout.prior_mean * self._per_unit
+        super().__init__(n_rows, scale[:-1], estimator.min_eigenvalue, std)
+
+    def information(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """See `BoundEstimator.information`."""
+        return self.gram(row_sets)[:, :-1, :-1]
 
     def select(self, row_sets: Sequence[IntArray]) -> Selection:
-        """See `BoundEstimator.select`."""
+        """See `BoundEstimator.select`; the sums are formed once."""
         gram, n_rows = self.gram(row_sets), np.array([len(rows) for rows in row_sets])
-        return Selection(partial(self._well_defined, gram), partial(self.solve, gram, n_rows))
+        return Selection(partial(self._well_defined, gram[:, :-1, :-1]), partial(self.solve, gram, n_rows))
 
-    def _well_defined(self, gram: FloatArray) -> BoolArray:
-        least = smallest_eigenvalue(self._counting_priors(gram[:, :-1, :-1]))
-        return np.asarray(least > self._estimator.min_eigenvalue)
+    def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
+        """See `BoundEstimator.fit`."""
+        return self.solve(self.gram(row_sets), np.array([len(rows) for rows in row_sets]), shift)
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        """See `BoundEstimator.fit_without`."""
+        """See `BoundEstimator.fit_without`; sums of the groups are taken from those of all rows."""
         left = len(rows) - np.array([len(group) for group in groups])
         return self.solve(self.gram([rows]) - self.gram(groups), left)
 
-    def prior_shifts(self, rows: IntArray) -> FloatArray:
-        """See `BoundEstimator.prior_shifts`."""
-        gram, n = self.gram([rows]), np.array([len(rows)])
-        shifted = [self.solve(gram, n, shift)[0] for shift in self.unit_shifts()]
-        return np.array(shifted).reshape(-1, self._n_p) - self.solve(gram, n)
-
-    def unit_shifts(self) -> FloatArray:
-        """Shifts ``(n_priors, n)`` of the means of the priors, each by its standard deviation alone."""
-        return np.asarray(np.diag(np.where(self._has_prior, self._prior_std, 0.0))[self._has_prior])
-
-    def null_space(self) -> NullSpace:
-        """See `BoundEstimator.null_space`."""
-        gram = self._counting_priors(self.gram([np.arange(self.n_rows)])[0, :-1, :-1])
-        return null_space(gram, self.scale[:-1], self._estimator.min_eigenvalue)
-
     def correlations(self) -> FloatArray:
-        """See `BoundEstimator.correlations`."""
+        """See `BoundEstimator.correlations`; priors have their weights."""
         gram = self.gram([np.arange(self.n_rows)])
         prior = self.prior_sums(gram, np.array([self.n_rows]))
-        own = gram[0, :-1, :-1]
-        return correlations(own if prior is None else own + np.diag(prior.weight[0]))
-
-    def _counting_priors(self, gram: FloatArray) -> FloatArray:
-        """Sums ``(..., n, n)`` of ``W^T W`` in which each prior is a row of unit size, for tests of their rank."""
-        return gram + np.diag(self._has_prior.astype(float)) if self._has_prior.any() else gram
+        return correlations(gram[0, :-1, :-1] + (0.0 if prior is None else np.diag(prior.weight[0])))
 
     def solve(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> FloatArray:
         """Parameters in their units from sums, over as many rows, in columns of unit RMS; priors may be shifted."""
         prior = self.prior_sums(gram, n_rows, shift)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self._estimator.solve(gram, prior) * self.scale[-1] / self.scale[:-1])
+            return np.asarray(self._estimator.solve(gram, prior) * self.known_scale / self.scale)
 
     def prior_sums(self, gram: FloatArray, n_rows: IntArray, shift: FloatArray | None = None) -> _PriorSums | None:
         """Sums of priors beside those of sets of as many rows; None without priors."""
-        if not self._has_prior.any():
+        if not len(self._shifts):
             return None
         noise = self._inflation * self._residual_variance(gram, n_rows)[0]
-        mean = self._prior_mean if shift is None else self._prior_mean + shift
+        mean = self._prior_mean if shift is None else self._prior_mean + shift * self._per_unit
         return _PriorSums(np.maximum(noise, _LEAST_NOISE**2)[:, None] / np.square(self._prior_std), mean)
 
     def _residual_variance(self, gram: FloatArray, n_rows: IntArray) -> tuple[FloatArray, FloatArray]:

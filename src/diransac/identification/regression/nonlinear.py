@@ -12,33 +12,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
+from diransac.arrays import FloatArray, IntArray, size_or_one
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import DiransacError, TimeLimitError
+from diransac.identification.core.rows import Rows, solve
 from diransac.identification.regression.estimators import (
+    BoundEstimator,
     OrdinaryLeastSquares,
-    Selection,
-    correlations,
     smallest_eigenvalue,
     solve_definite,
 )
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.rows import MotionRows, NullSpace, Solution, null_space, regression
+from diransac.identification.regression.rows import MotionRows, NullSpace, RowsSolution, regression
 from diransac.identification.regression.uncertainty import rows_without, score_inflation
 from diransac.model import Model, Parameter
 from diransac.simulation.compiler import Map
 
 _ROWS_FOR_STARTS = 100
-# Bounds of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12.
+"""Rows on which starting points are compared."""
 _LOG_BOUND = 27.6
+"""Bound of the logarithm of a positive parameter that has none of its own: 1e-12 to 1e12."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class NonlinearLeastSquares:
         return BoundNonlinear(self, dataset)
 
 
-def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows]) -> Solution | None:
+def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows]) -> RowsSolution | None:
     """Nonlinear least squares of rows of motions, as `solved` for affine models; None where no row is finite.
 
     Parameters
@@ -87,7 +87,7 @@ def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[Motio
 
     Returns
     -------
-    Solution or None
+    RowsSolution or None
     """
     names = (model.coordinates, model.velocities, model.accelerations, model.inputs)
     try:
@@ -101,10 +101,10 @@ def solved_nonlinear(model: Model, layout: ParameterLayout, rows: Sequence[Motio
     except (DiransacError, np.linalg.LinAlgError):
         return None
     nothing = NullSpace(np.zeros((0, len(layout))), np.ones(len(layout)))
-    return Solution(bound.of_all_rows, np.zeros(len(layout)), bound.median_errors(), nothing, has_known_terms=True)
+    return RowsSolution(bound.of_all_rows, np.zeros(len(layout)), bound.median_errors(), nothing, has_known_terms=True)
 
 
-class BoundNonlinear:
+class BoundNonlinear(BoundEstimator):
     """Measured accelerations and sensors of the usable rows, and the compiled model of them."""
 
     def __init__(self, settings: NonlinearLeastSquares, dataset: Dataset) -> None:
@@ -126,8 +126,10 @@ class BoundNonlinear:
         self._starts = self.chart.starts(settings.n_starts)
         self._linear = OrdinaryLeastSquares().bind(dataset) if model.is_affine else None
         if not (model.is_affine or model.nonlinear_parameters):
-            determined, values = _solution_of_affine_part(dataset)
-            self._starts[:, determined] = self.chart.clip(self.chart.to_free(values[None]))[:, determined]
+            # Equations and affine sensors determine the parameters that they contain.
+            affine = solve(Rows(*regression(dataset)))
+            determined = affine.rows.W.any(axis=(0, 1))
+            self._starts[:, determined] = self.chart.clip(self.chart.to_free(affine.p[None]))[:, determined]
         self._inflation = 1.0
         everything = np.arange(self.n_rows)[None]
         whole = self.chart.to_free(self._fit_equal(everything[:, :: max(1, self.n_rows // 2000)]))
@@ -138,24 +140,15 @@ class BoundNonlinear:
         scale = np.sqrt(np.square(J).mean(axis=(0, 1)))
         J = J / size_or_one(scale)
         self._blocks = np.einsum("nri,nrj->nij", J, J)
-        self._column_scale = scale / self.chart.slope(whole)[0]
+        scale = scale / self.chart.slope(whole)[0]
+        super().__init__(self.n_rows, scale, settings.min_eigenvalue, self._layout.prior_std)
         if len(self._layout.with_prior):
             scores = np.einsum("nri,nr->ni", J, np.nan_to_num(errors))
             self._inflation = score_inflation(scores, self._blocks.sum(axis=0), float(np.square(errors).mean()))
 
-    def select(self, row_sets: Sequence[IntArray]) -> Selection:
-        """See `BoundEstimator.select`."""
-        return Selection(partial(self.well_defined, row_sets), partial(self.fit, row_sets))
-
-    def well_defined(self, row_sets: Sequence[IntArray]) -> BoolArray:
-        """Mask of the sets of rows in which the Jacobian at the fit of all rows has full rank."""
-        gram = np.array([self._blocks[rows].sum(axis=0) for rows in row_sets]) + self._counted_priors()
-        return np.asarray(smallest_eigenvalue(gram) > self._settings.min_eigenvalue)
-
-    def null_space(self) -> NullSpace:
-        """See `BoundEstimator.null_space`."""
-        gram = self._blocks.sum(axis=0) + self._counted_priors()
-        return null_space(gram, self._column_scale, self._settings.min_eigenvalue)
+    def information(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """See `BoundEstimator.information`: of the Jacobian at the fit of all rows."""
+        return np.array([self._blocks[rows].sum(axis=0) for rows in row_sets])
 
     def median_errors(self) -> FloatArray:
         """Median error ``(r,)`` of the fit of all rows, over the size of each signal."""
@@ -172,24 +165,15 @@ class BoundNonlinear:
         gram = np.einsum("bri,brj->bij", J, J)
         return bool((smallest_eigenvalue(gram) > self._settings.min_eigenvalue).any()) if len(J) else False
 
-    def correlations(self) -> FloatArray:
-        """See `BoundEstimator.correlations`."""
-        return correlations(self._blocks.sum(axis=0) + self._counted_priors())
-
-    def _counted_priors(self) -> FloatArray:
-        """Each prior as a row of unit size, ``(n, n)``."""
-        return np.diag(np.isfinite(self._layout.prior_std).astype(float))
-
     def prior_shifts(self, rows: IntArray) -> FloatArray:
         """See `BoundEstimator.prior_shifts`."""
         here = self._fit_equal(rows[None])
         start = self.chart.to_free(here)[:, None]
-        shifts = np.diag(self._layout.prior_std)[self._layout.with_prior]
-        shifted = [self._likeliest(rows[None], start, np.where(np.isfinite(x), x, 0.0))[0] for x in shifts]
+        shifted = [self._likeliest(rows[None], start, shift)[0] for shift in self._shifts]
         return np.array(shifted).reshape(-1, self._n_p) - here
 
-    def fit(self, row_sets: Sequence[IntArray]) -> FloatArray:
-        """Parameters ``(n_sets, n)``."""
+    def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
+        """See `BoundEstimator.fit`."""
         fits = np.empty((len(row_sets), self._n_p))
         for length in {len(rows) for rows in row_sets}:
             places = [i for i, rows in enumerate(row_sets) if len(rows) == length]
@@ -197,7 +181,7 @@ class BoundNonlinear:
             at_a_time = max(1, 300_000 // (len(self._starts) * max(1, length)))
             for first in range(0, len(places), at_a_time):
                 some = places[first : first + at_a_time]
-                fits[some] = self._fit_equal(np.array([row_sets[i] for i in some]))
+                fits[some] = self._fit_equal(np.array([row_sets[i] for i in some]), shift)
         return fits
 
     def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
@@ -233,7 +217,7 @@ class BoundNonlinear:
         steps = np.nan_to_num(solve_definite(left, slopes))
         return self.chart.to_parameters(self.chart.clip(free - steps))
 
-    def _fit_equal(self, rows: IntArray) -> FloatArray:
+    def _fit_equal(self, rows: IntArray, shift: FloatArray | None = None) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``: each from the best of its followed starts."""
         starts, (n_sets, n) = self._starts, rows.shape
         few = rows[:, :: max(1, n // _ROWS_FOR_STARTS)]
@@ -245,7 +229,7 @@ class BoundNonlinear:
         if self._linear is not None:
             solved = self.chart.clip(self.chart.to_free(self._linear.select(list(rows)).fit()))
             followed = np.concatenate([solved[:, None], followed], axis=1)
-        return self._likeliest(rows, followed)
+        return self._likeliest(rows, followed, shift)
 
     def _likeliest(self, rows: IntArray, starts: FloatArray, shift: FloatArray | None = None) -> FloatArray:
         """Parameters ``(B, n_p)`` from row sets ``(B, n)``, each from the best of its starts ``(B, n_starts, n_p)``.
@@ -379,15 +363,6 @@ def _standard_deviations(sensors: FloatArray) -> list[float]:
     """Standard deviation of the finite values of each sensor; 0 without any."""
     finite = [x[np.isfinite(x)] for x in sensors.T]
     return [float(x.std()) if len(x) else 0.0 for x in finite]
-
-
-def _solution_of_affine_part(dataset: Dataset) -> tuple[BoolArray, FloatArray]:
-    """Parameters ``(n,)`` in the equations and in affine sensors, as a mask, and their ordinary least squares."""
-    W, b = regression(dataset)
-    rows = W.reshape(-1, W.shape[2])
-    scale = np.abs(rows).max(axis=0)
-    solved = np.linalg.lstsq(rows / size_or_one(scale), b.ravel(), rcond=None)[0]
-    return scale > 0.0, solved / size_or_one(scale)
 
 
 class ParameterChart:

@@ -1,9 +1,4 @@
-"""Rows of the equations: ``W p = b`` of a dataset, robust least squares of rows of motions, and null spaces of rows.
-
-References
-----------
-Holland and Welsch 1977 (iteratively reweighted least squares).
-"""
+"""Rows of the equations: ``W p = b`` of a dataset, robust least squares of rows of motions, and null spaces of rows."""
 
 from __future__ import annotations
 
@@ -18,15 +13,11 @@ from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.segment import Segment
+from diransac.identification.core.rows import GEMAN_MCCLURE, Rows, Solution, inclusive_bounds, solve
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.model import Model
 from diransac.simulation.compiler import compile_map
 
-_TINY = 1e-300
-# Ridge over the mean diagonal of the information in columns of unit RMS: about the rounding error of its solution.
-_RIDGE = 1e-13
-# Relative step from which on reweighting goes on.
-_CONVERGED = 1e-4
 EXACT = 1e-6
 """Residual over the size of terms that is exact."""
 
@@ -57,7 +48,7 @@ def motion_rows(dataset: Dataset) -> list[MotionRows]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Solution:
+class RowsSolution:
     """Robust least squares of all rows of logs.
 
     Parameters
@@ -84,7 +75,7 @@ class Solution:
         return float(np.prod(self.residuals))
 
 
-def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> Solution | None:
+def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> RowsSolution | None:
     """Solution of ``W p = b`` by iteratively reweighted least squares; None where no row is finite.
 
     Parameters
@@ -95,79 +86,37 @@ def solved(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) ->
 
     Returns
     -------
-    Solution or None
+    RowsSolution or None
     """
     rows, _ = scaled_equations(model, layout, logs)
-    found = robust_fit(rows) if len(rows) else None
+    found = robust_fit(rows) if len(rows.b) else None
     if found is None:
         return None
-    scaled = rows.reshape(-1, rows.shape[2]) / found.scale
-    A, y, p = scaled[:, :-1], scaled[:, -1], found.scaled
-    residuals, whole = np.abs(A @ p - y), np.abs(A) @ np.abs(p) + np.abs(y)
-    sizes = (np.median(x.reshape(-1, rows.shape[1]), axis=0) + _TINY for x in (residuals, whole))
+    sizes = np.abs(rows.residuals(found.p)), np.abs(rows.W) @ np.abs(found.p) + np.abs(rows.b)
+    ratios = np.divide(*(np.median(x, axis=0) + np.finfo(float).tiny for x in sizes))
     # The information at the solution: rows that are outliers there inform of nothing.
-    weighted = A * found.weights[:, None]
-    size = size_or_one(np.sqrt(np.square(weighted).mean(axis=0)))
-    return Solution(
-        found.parameters,
-        standard_errors(rows, found),
-        np.maximum(np.divide(*sizes), EXACT),
-        null_space((weighted / size).T @ (weighted / size), size * found.scale[:-1], 1e-9 * len(A)),
-        bool(rows[:, :, -1].any()),
-    )
+    A = (rows.W * found.weights[:, :, None]).reshape(-1, rows.W.shape[2])
+    size = np.sqrt(np.square(A).mean(axis=0))
+    unit = A / size_or_one(size)
+    space = null_space(unit.T @ unit, size_or_one(size), 1e-9 * len(A))
+    return RowsSolution(found.p, found.errors(), np.maximum(ratios, EXACT), space, bool(rows.b.any()))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class RobustFit:
-    """Iteratively reweighted least squares of rows ``[W b]`` in columns of unit RMS.
+def robust_fit(rows: Rows, bounds: tuple[FloatArray, FloatArray] | None = None) -> Solution | None:
+    """Robust least squares of scaled equations, of which many rows may be outliers; None if it overflows.
 
     Parameters
     ----------
-    scaled : (n,) array
-        Parameters in these columns.
-    scale : (n + 1,) array
-        RMS of each column.
-    weights : (n_rows n_eq,) array
-    """
-
-    scaled: FloatArray
-    scale: FloatArray
-    weights: FloatArray
-
-    @property
-    def parameters(self) -> FloatArray:
-        """Parameters ``(n,)``, each in its unit."""
-        return np.asarray(self.scaled * self.scale[-1] / self.scale[:-1])
-
-
-def robust_fit(rows: FloatArray) -> RobustFit | None:
-    """Fit of scaled equations ``(n, n_eq, n_p + 1)``; None if it overflows.
-
-    Parameters
-    ----------
-    rows : (n, n_eq, n_p + 1) array
+    rows : Rows
         As from `scaled_equations`.
+    bounds : pair of (n,) array, optional
+        Lower and upper.
     """
-    n_equations, rows = rows.shape[1], rows.reshape(-1, rows.shape[2])
-    scale = size_or_one(np.sqrt(np.square(rows).mean(axis=0)))
-    rows = rows / scale
-    A, y, size = rows[:, :-1], rows[:, -1], np.linalg.norm(rows, axis=1)
-    weights = 1.0 / (1.0 + size / (np.median(size) + _TINY))
-    p = np.zeros(A.shape[1])
-    for _ in range(10):
-        before, weighted = p, A * np.square(weights)[:, None]
-        gram = weighted.T @ A
-        ridge = _RIDGE * (float(np.trace(gram)) / max(1, len(gram)) or 1.0)
-        p = np.linalg.solve(gram + ridge * np.eye(len(gram)), weighted.T @ y)
-        residuals = np.abs(A @ p - y)
-        if not np.isfinite(residuals).all():
-            return None
-        # Each equation has its own residuals: zeros satisfy one without a known term, and would outweigh the others.
-        middle = np.median(residuals.reshape(-1, n_equations), axis=0) + _TINY
-        weights = 1.0 / (1.0 + np.square(residuals.reshape(-1, n_equations) / (3.0 * middle))).ravel()
-        if np.abs(p - before).max(initial=0.0) <= _CONVERGED * np.abs(p).max(initial=0.0):
-            break
-    return RobustFit(p, scale, weights)
+    try:
+        found = solve(rows, bounds=bounds, loss=GEMAN_MCCLURE)
+    except np.linalg.LinAlgError:
+        return None
+    return found if np.isfinite(rows.residuals(found.p)).all() else None
 
 
 def lacks_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> bool:
@@ -180,28 +129,11 @@ def lacks_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[Moti
     logs : sequence of MotionRows
     """
     rows, _ = scaled_equations(model, layout, logs)
-    return len(rows) > 0 and not rows[:, :, -1].any()
+    return len(rows.b) > 0 and not rows.b.any()
 
 
-def standard_errors(rows: FloatArray, fit: RobustFit) -> FloatArray:
-    """Standard errors ``(n,)`` of a fit of scaled equations ``(n_rows, n_eq, n + 1)``, each in its unit."""
-    scaled = rows.reshape(-1, rows.shape[2]) / fit.scale
-    A, y, weights = scaled[:, :-1], scaled[:, -1], fit.weights
-    errors = _errors(A * weights[:, None], weights * (A @ fit.scaled - y))
-    return np.asarray(errors * fit.scale[-1] / fit.scale[:-1])
-
-
-def _errors(A: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Standard errors ``(n,)`` of least squares, from sums of scores over 30 batches of rows, in their order."""
-    sums = np.add.reduceat(A * residuals[:, None], np.arange(0, len(A), max(1, len(A) // 30)), axis=0)
-    H = A.T @ A
-    inverse = np.linalg.pinv(H, hermitian=True)
-    found = np.sqrt(np.square(sums @ inverse).sum(axis=0))
-    return np.asarray(np.where(np.diag(H) > 0.0, found, np.inf))
-
-
-def scaled_equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[FloatArray, BoolArray]:
-    """Finite rows ``[W b]`` of all logs, ``(n, n_eq, n_p + 1)``, each equation of unit size; mask of these rows.
+def scaled_equations(model: Model, layout: ParameterLayout, logs: Sequence[MotionRows]) -> tuple[Rows, BoolArray]:
+    """Finite rows of all logs, each equation of unit size; mask ``(N,)`` of these rows.
 
     Parameters
     ----------
@@ -209,23 +141,18 @@ def scaled_equations(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     layout : ParameterLayout
     logs : sequence of MotionRows
         Of which 5,000 rows each are enough to find a cause, and more are left out.
-
-    Returns
-    -------
-    rows : (n, n_eq, n_p + 1) array
-    finite : (N,) bool array
     """
     parts = []
     for i, one in enumerate(logs):
         every = max(1, len(one.q) // 5000)
         few = [np.ascontiguousarray(x[::every]) for x in (one.q, one.v, one.a, one.u, one.y)]
         W, b = regression_rows(model, *few)
-        W = layout.scattered(W, i)
-        parts.append(np.concatenate([W, b[:, :, None], _known_sizes(model, few, b)[:, :, None]], axis=2))
-    rows = np.concatenate(parts)
-    finite = (np.abs(rows) < 1e150).all(axis=(1, 2))  # whose squares do not overflow
-    rows, sizes = rows[finite, :, :-1], rows[finite, :, -1]
-    return (rows / _sizes(rows, sizes)[:, None] if len(rows) else rows), finite
+        parts.append((layout.scattered(W, i), b, _known_sizes(model, few, b)))
+    W, b, sizes = map(np.concatenate, zip(*parts, strict=True))
+    columns = np.concatenate([W, b[:, :, None], sizes[:, :, None]], axis=2)
+    finite = (np.abs(columns) < 1e150).all(axis=(1, 2))  # whose squares do not overflow
+    rows = Rows(W[finite], b[finite])
+    return (rows.over(_sizes(rows, sizes[finite])) if finite.any() else rows), finite
 
 
 def _known_sizes(model: Model, motion: Sequence[FloatArray], b: FloatArray) -> FloatArray:
@@ -245,22 +172,19 @@ def _known_terms(model: Model) -> ca.Function:
     return ca.Function("known", [q, v, a, u], [ca.densify(sizes)])
 
 
-def _sizes(rows: FloatArray, known_terms: FloatArray) -> FloatArray:
-    """Size ``(n_eq,)`` of each equation ``[W b]`` ``(n, n_eq, n_p + 1)``: the median of its known terms ``(n, n_eq)``.
+def _sizes(rows: Rows, known_terms: FloatArray) -> FloatArray:
+    """Size ``(n_eq,)`` of each equation: the median of its known terms ``(n, n_eq)``.
 
     Parameters take up units of columns, so that these change no weight of one equation against another.  An equation
     without a known term has the size of its other terms, with the parameters that the others give.
     """
-    W = rows[:, :, :-1]
     size = np.array([np.median(x[x > 0.0]) if x.any() else 0.0 for x in known_terms.T])
     size = np.where(size > 1e-9 * size.max(), size, 0.0)
     known = size > 0.0
     if known.any() and not known.all():
-        A, y = ((x[:, known] / size[known, None]).reshape(-1, x.shape[2]) for x in (W, rows[:, :, -1:]))
-        column = size_or_one(np.sqrt(np.square(A).mean(axis=0)))
-        p = np.linalg.lstsq(A / column, y[:, 0], rcond=None)[0] / column
-        size = np.where(known, size, np.median(np.abs(W) @ np.abs(p), axis=0))
-    whole = np.median(np.abs(rows).sum(axis=2), axis=0)
+        p = solve(Rows(rows.W[:, known], rows.b[:, known]), 1.0 / size[known]).p
+        size = np.where(known, size, np.median(np.abs(rows.W) @ np.abs(p), axis=0))
+    whole = np.median(np.abs(rows.W).sum(axis=2) + np.abs(rows.b), axis=0)
     return np.where(size > 0.0, size, size_or_one(whole))
 
 
@@ -273,8 +197,7 @@ def outside_bounds(layout: ParameterLayout, parameters: FloatArray, errors: Floa
     parameters, errors : (n,) array
         Estimate with standard errors, each in its unit.
     """
-    lower, upper = np.array([(max(x.lower, 0.0) if x.positive else x.lower, x.upper) for x in layout.bounds]).T
-    nearest = np.clip(parameters, lower, upper)
+    nearest = np.clip(parameters, *inclusive_bounds(layout.bounds, zero=True))
     far = np.abs(parameters - nearest) > CLEAR * errors
     outside = set(layout.violations(parameters))
     return [n for n, x in zip(layout.names, far, strict=True) if n in outside and x]
@@ -305,10 +228,9 @@ def excited(model: Model, layout: ParameterLayout, rows: Sequence[MotionRows], p
     A = (J / size_or_one(size)[:, None]).reshape(-1, J.shape[2])
     norms = np.linalg.norm(A, axis=0)
     A = A / size_or_one(norms)
-    pairs = ((A[:, k], np.delete(A, k, axis=1)) for k in range(A.shape[1]))
-    free = [np.linalg.norm(x - others @ np.linalg.lstsq(others, x, rcond=None)[0]) for x, others in pairs]
-    # Equations inform about a parameter if the other columns leave a tenth of its own.
-    return np.asarray((norms > 0.0) & (np.array(free) > 0.1))
+    # Part of a column that the others leave, for which equations inform about a parameter.
+    free = 1.0 / np.sqrt(np.diag(np.linalg.inv(A.T @ A + EXACT**2 * np.eye(A.shape[1]))))
+    return np.asarray((norms > 0.0) & (free > 0.1))
 
 
 def regression_rows(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
@@ -18,10 +17,8 @@ from diransac.identification.regression.estimators import (
     BoundSums,
     Estimator,
     OrdinaryLeastSquares,
-    Selection,
 )
-from diransac.identification.regression.rows import NullSpace, regression
-from diransac.identification.regression.uncertainty import rows_without
+from diransac.identification.regression.rows import regression
 
 
 class LinearRegressor(Protocol):
@@ -65,39 +62,31 @@ class ScikitLearnEstimator:
         return _BoundScikitLearn(self, *regression(dataset), dataset.layout)
 
 
-class _BoundScikitLearn:
+class _BoundScikitLearn(BoundEstimator):
     """Rows of ``W`` and ``b`` for a scikit-learn regressor; their sums decide whether a set is well-defined."""
 
     def __init__(self, estimator: ScikitLearnEstimator, W: FloatArray, b: FloatArray, layout: ParameterLayout) -> None:
         self._regressor = estimator.regressor
-        self._sums = BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b, layout)
-        self.n_rows = len(W)
-        self._W, self._b = W / self._sums.scale[:-1], b / self._sums.scale[-1]
+        self._sums = sums = BoundSums(OrdinaryLeastSquares(estimator.min_eigenvalue), W, b, layout)
+        super().__init__(len(W), sums.scale, estimator.min_eigenvalue, layout.prior_std)
+        self._W, self._b = W / sums.scale, b / sums.known_scale
 
-    def select(self, row_sets: Sequence[IntArray]) -> Selection:
-        return Selection(self._sums.select(row_sets).well_defined, partial(self.fit, row_sets))
-
-    def null_space(self) -> NullSpace:
-        return self._sums.null_space()
+    def information(self, row_sets: Sequence[IntArray]) -> FloatArray:
+        """See `BoundEstimator.information`."""
+        return self._sums.information(row_sets)
 
     def correlations(self) -> FloatArray:
+        """See `BoundEstimator.correlations`."""
         return self._sums.correlations()
 
-    def fit_without(self, groups: Sequence[IntArray], rows: IntArray) -> FloatArray:
-        return self.fit([rows_without(rows, group) for group in groups])
-
-    def prior_shifts(self, rows: IntArray) -> FloatArray:
-        shifted = [self.fit([rows], shift)[0] for shift in self._sums.unit_shifts()]
-        return np.array(shifted).reshape(-1, self._W.shape[2]) - self.fit([rows])
-
     def fit(self, row_sets: Sequence[IntArray], shift: FloatArray | None = None) -> FloatArray:
-        """Parameters ``(n_sets, n)`` in their units; priors may be shifted."""
-        n_rows = np.array([len(rows) for rows in row_sets])
+        """See `BoundEstimator.fit`; each prior is a further row, by the square root of its weight."""
+        n_rows, n_p = np.array([len(rows) for rows in row_sets]), self._W.shape[2]
         prior = self._sums.prior_sums(self._sums.gram(row_sets), n_rows, shift)
-        roots = np.zeros((len(row_sets), self._W.shape[2])) if prior is None else np.sqrt(prior.weight)
-        mean = np.zeros(self._W.shape[2]) if prior is None else prior.mean
+        roots = np.zeros((len(row_sets), n_p)) if prior is None else np.sqrt(prior.weight)
+        mean = np.zeros(n_p) if prior is None else prior.mean
         fits = np.array([self._fit_one(rows, root, mean) for rows, root in zip(row_sets, roots, strict=True)])
-        return np.asarray(fits.reshape(len(row_sets), -1) * self._sums.scale[-1] / self._sums.scale[:-1])
+        return np.asarray(fits.reshape(len(row_sets), -1) * self._sums.known_scale / self.scale)
 
     def _fit_one(self, rows: IntArray, root: FloatArray, mean: FloatArray) -> FloatArray:
         """Parameters from rows, and from one row for each prior, by the square root of its weight."""
@@ -121,18 +110,14 @@ def _without_intercept(regressor: LinearRegressor) -> LinearRegressor:
 
     fresh = clone(regressor)
     known = fresh.get_params(deep=True)
-    changes: dict[str, Any] = {}
-    if "fit_intercept" in known:
-        changes["fit_intercept"] = False
-    elif "estimator__fit_intercept" in known:
-        changes["estimator__fit_intercept"] = False
-    elif "estimator" in known and known["estimator"] is None:
+    changes: dict[str, Any] = {n: False for n in ("fit_intercept", "estimator__fit_intercept") if n in known}
+    if not changes and known.get("estimator", "") is None:
         changes["estimator"] = LinearRegression(fit_intercept=False)
-    else:
+    if not changes:
         raise SettingsError(
             f"{type(regressor).__name__} cannot be fitted without an intercept; give a linear regressor"
         )
-    if "random_state" in known and known["random_state"] is None:
+    if known.get("random_state", 0) is None:
         changes["random_state"] = 0
     return cast("LinearRegressor", fresh.set_params(**changes))
 
@@ -153,10 +138,11 @@ def as_estimator(candidate: object) -> Estimator:
     SettingsError
         The candidate is neither.
     """
-    if hasattr(candidate, "bind") and not isinstance(candidate, type):
-        return cast("Estimator", candidate)
-    if hasattr(candidate, "fit") and hasattr(candidate, "get_params") and not isinstance(candidate, type):
-        return ScikitLearnEstimator(cast("LinearRegressor", candidate))
+    if not isinstance(candidate, type):
+        if hasattr(candidate, "bind"):
+            return cast("Estimator", candidate)
+        if hasattr(candidate, "fit") and hasattr(candidate, "get_params"):
+            return ScikitLearnEstimator(cast("LinearRegressor", candidate))
     raise SettingsError(
         f"estimator is {candidate!r}; give dr.OrdinaryLeastSquares(), dr.TotalLeastSquares(), "
         "dr.NonlinearLeastSquares() or a scikit-learn linear regressor"

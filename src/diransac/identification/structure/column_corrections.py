@@ -23,6 +23,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.units import conversion, one_turn
+from diransac.identification.core.rows import Rows, inclusive_bounds
 from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import (
     EXACT,
@@ -30,7 +31,6 @@ from diransac.identification.regression.rows import (
     outside_bounds,
     robust_fit,
     scaled_equations,
-    standard_errors,
 )
 from diransac.model.expressions import applied, steps
 
@@ -185,30 +185,21 @@ class CorrectionTests:
         """Parameters, standard errors and residuals of ``W p = b``; None without a known term."""
         rows, finite = scaled_equations(model, self.layout, parts)
         predicted = np.concatenate(held)[finite]
-        fit = robust_fit(rows[~predicted]) if predicted.any() and not predicted.all() else None
-        if fit is None or not rows[:, :, -1].any():
+        if not predicted.any() or predicted.all() or not rows.b.any():
             return None
-        possible = self._within_bounds(rows[~predicted], fit.parameters)
-        W, b = rows[predicted, :, :-1], rows[predicted, :, -1]
-        residuals = np.median(np.abs(W @ possible - b), axis=0)
+        fitted = Rows(rows.W[~predicted], rows.b[~predicted])
+        bounds, found = inclusive_bounds(self.layout.bounds, zero=True), robust_fit(fitted)
+        if found is None:
+            return None
+        is_possible = (np.clip(found.p, *bounds) == found.p).all()
+        possible = found if is_possible else (robust_fit(fitted, bounds) or found)
+        W, b = rows.W[predicted], rows.b[predicted]
+        residuals = np.median(np.abs(W @ possible.p - b), axis=0)
         # Zero solves an equation without a known term: its residual is that over its terms.
-        whole = np.median(np.abs(W) @ np.abs(possible), axis=0)
+        whole = np.median(np.abs(W) @ np.abs(possible.p), axis=0)
         of_terms = np.where(whole > EXACT, residuals / np.maximum(whole, EXACT), 1.0)
         residuals = np.where(b.any(axis=0), residuals, of_terms)
-        return fit.parameters, standard_errors(rows[~predicted], fit), residuals
-
-    def _within_bounds(self, rows: FloatArray, p: FloatArray) -> FloatArray:
-        """Parameters ``(n,)`` within bounds: those that leave them are held there, and the others fitted again."""
-        lower, upper = np.array([(max(x.lower, 0.0) if x.positive else x.lower, x.upper) for x in self.layout.bounds]).T
-        held = np.zeros(len(p), bool)
-        while ((p < lower) | (p > upper)).any():
-            held |= (p < lower) | (p > upper)
-            p = np.clip(p, lower, upper)
-            known = rows[:, :, -1] - rows[:, :, :-1][:, :, held] @ p[held]
-            if held.all() or (fit := robust_fit(np.dstack([rows[:, :, :-1][:, :, ~held], known]))) is None:
-                return p
-            p[~held] = fit.parameters
-        return p
+        return found.p, found.errors(), residuals
 
     def _nonlinear(
         self, model: Model, parts: Sequence[MotionRows], held: Sequence[BoolArray]

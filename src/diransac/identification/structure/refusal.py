@@ -18,7 +18,7 @@ from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import (
     MotionRows,
-    Solution,
+    RowsSolution,
     lacks_known_terms,
     motion_rows,
     outside_bounds,
@@ -131,7 +131,7 @@ def _ranges(model: Model, logs: Sequence[MotionRows]) -> Ranges:
     return tuple((n, *bulk_range(x)) for n, x in zip((*model.state, *model.inputs), columns, strict=True))
 
 
-def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: Solution, of_model: Sequence[Ambiguity]) -> str:
+def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: RowsSolution, of_model: Sequence[Ambiguity]) -> str:
     """The cause where least squares of all rows has a solution: ambiguities, bounds, or noise."""
     if of_model:
         return equations_in_words(of_model)

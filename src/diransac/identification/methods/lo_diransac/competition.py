@@ -207,7 +207,7 @@ class Contest:
 
     def add_fit(self, found: Searched) -> None:
         """Let the estimates of a joint fit take part, before the others, and instead of those of another fit."""
-        some = _estimates_of_fit(found.likeliest, self._acting(found), self.blocks, projection=self.settings.projection)
+        some = _estimates_of_fit(found.likeliest, self._acting(found), self.blocks)
         others = [x for x in self.entries if isinstance(x.origin, Motion)]
         self.entries = [*(_Entry(x, found.likeliest) for x in some), *others]
 
@@ -411,13 +411,11 @@ class Contest:
         return Competition(self.candidates[c.best].name, judged.judge.horizons, competitors)
 
 
-def _estimates_of_fit(
-    explanation: Explanation, acting: ActingInputs, blocks: Blocks, *, projection: bool
-) -> Iterator[Candidate]:
+def _estimates_of_fit(explanation: Explanation, acting: ActingInputs, blocks: Blocks) -> Iterator[Candidate]:
     """Parameters read from a fit: by least squares on its motion over windows of each length, and its own."""
     intervals, fit = explanation.intervals, explanation.refinement.fit
     block = blocks.of_row[intervals.starts]
-    if projection and not explanation.exact:
+    if not explanation.exact:
         for seconds, estimate, parameters, parts in projected_candidates(intervals, fit):
             if intervals.layout.violations(parameters) or not np.isfinite(parameters).all():
                 continue

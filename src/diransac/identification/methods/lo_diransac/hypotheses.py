@@ -13,35 +13,36 @@ Torr, Zisserman 2000.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, row_blocks
 from diransac.identification.core.noise import lower_scale
-from diransac.identification.methods.lo_diransac.screening import without_spikes
+from diransac.identification.core.rows import Rows, inclusive_bounds, solve, solve_sized
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.data.dataset import Dataset, ParameterLayout
+    from diransac.data.dataset import Dataset
     from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.regression.estimators import BoundEstimator
+    from diransac.model import Model
 
 _OVERLAP = 5
-# Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs.
+"""Averages that overlap at a row."""
+_N_SCREENED = 12
+"""Intervals on which all hypotheses are scored, and hypotheses that are scored on all intervals."""
+_LARGEST_SAMPLE = 4
+"""Rows of each equation in the largest sample, over the number of parameters."""
 _NUMBERS_AT_A_TIME = 1_000_000
-# Least residual of an equation over its terms: smoothing is not exact.
+"""Numbers that are held at a time for several hypotheses: bounds the memory, whatever the length of the logs."""
 _SMALL_RESIDUAL = 0.01
-# Known terms that are as small beside those of another equation are rounding errors.
-_ROUNDING = 1e-9
-# Decrease of the log residuals of each signal by which inputs without spikes are those that acted.
-_CLEAR_GAIN = float(np.log(1.25))
+"""Least residual of an equation over its terms: smoothing is not exact."""
 
 
 def find_hypotheses(
@@ -75,56 +76,6 @@ def find_hypotheses(
     return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
 
 
-def find_spikes(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    motion: Motion,
-    hypotheses: FloatArray,
-    seed: int,
-    dataset: Dataset,
-) -> tuple[ShootingIntervals, FloatArray, int]:
-    """The intervals without spikes of the inputs, where simulations agree better with the logs then.
-
-    A controller's spikes act on the machine, those of a torque sensor do not; both look alike.  Where simulations by
-    the best hypothesis agree less well without them, they act, and no other hypotheses are sought.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    hypotheses : (n_hypotheses, n) array
-        Of these intervals, best first.
-    seed : int
-    dataset : Dataset
-
-    Returns
-    -------
-    intervals : ShootingIntervals
-    hypotheses : (n_hypotheses, n) array
-        Best first.
-    n_spikes : int
-        Number of rows with spikes; 0 for the given intervals.
-    """
-    cleaned = [without_spikes(intervals.recorded[rows], settings.input_threshold) for rows in intervals.rows_of_logs]
-    n_spikes = sum(n for _, n in cleaned)
-    if not n_spikes:
-        return intervals, hypotheses, 0
-    trial = replace(intervals, recorded=np.concatenate([u for u, _ in cleaned]))
-
-    def scores(hypothesis: FloatArray) -> FloatArray:
-        every = np.arange(len(intervals))
-        return np.array([robust_scores(x, motion, hypothesis, every)[0] for x in (intervals, trial)])
-
-    known = scores(hypotheses[:1])
-    if known[1] >= known[0] or not len(found := find_hypotheses(settings, trial, motion, seed, dataset)):
-        return intervals, hypotheses, 0
-    before, after = np.minimum(known, scores(found[:1]))
-    is_better = before - after > _CLEAR_GAIN * intervals.known.any(axis=0).sum()
-    return (trial, found, n_spikes) if is_better else (intervals, hypotheses, 0)
-
-
 def _linear(
     settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
@@ -135,8 +86,9 @@ def _linear(
     """
     weak, layout = weak_form(intervals, motion), dataset.layout
     n = len(intervals)
-    few = np.unique(np.linspace(0, n - 1, min(settings.n_screening_intervals, n)).astype(int))
-    samples = weak.solve_sized(random_sets(settings, weak, seed), layout)
+    few = np.unique(np.linspace(0, n - 1, min(_N_SCREENED, n)).astype(int))
+    prior = layout.prior_mean, layout.prior_std
+    samples = solve_sized(weak, random_sets(settings, weak, seed), prior)
     missing = _in_sensors_alone(dataset) & ~weak.W.any(axis=(0, 1)) & np.isinf(layout.prior_std)
     if missing.any() and dataset.model.is_affine:
         samples[:, missing] = [1.0 if x.positive else 0.0 for x, m in zip(layout.bounds, missing, strict=True) if m]
@@ -147,7 +99,18 @@ def _linear(
     if not len(samples):
         return samples
     order = np.argsort(robust_scores(intervals, motion, samples, few), kind="stable")
-    return samples[order[: settings.n_finalists]]
+    return samples[order[:_N_SCREENED]]
+
+
+def n_samples(settings: LoDiransacSettings, model: Model) -> int:
+    """Number of random samples, of which nonlinear least squares has half as many.
+
+    Parameters
+    ----------
+    settings : LoDiransacSettings
+    model : Model
+    """
+    return settings.n_samples // 2 if model.nonlinear_parameters else settings.n_samples
 
 
 def _in_sensors_alone(dataset: Dataset) -> BoolArray:
@@ -161,10 +124,9 @@ def _nonlinear(
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     bound = _of_smoothed_motion(intervals, motion, dataset)
-    n, n_p, largest = bound.n_rows, intervals.n_p, settings.largest_sample
-    k = np.arange(settings.n_nonlinear_samples)
-    rows = sample_rows(seed, k, n, 0, min(n, largest * n_p))
-    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p, largest), strict=True)]
+    n, n_p, k = bound.n_rows, intervals.n_p, np.arange(n_samples(settings, intervals.model))
+    rows = sample_rows(seed, k, n, 0, min(n, _LARGEST_SAMPLE * n_p))
+    samples = [np.sort(some[:size]) for some, size in zip(rows, _sizes(seed, k, n, n_p), strict=True)]
     return bound.select([np.arange(n), *samples]).fit()
 
 
@@ -184,89 +146,13 @@ def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: D
     return NonlinearLeastSquares().bind(replace(dataset, segments=segments))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class WeakForm:
-    """Averaged rows of ``W p = b``.
-
-    Parameters
-    ----------
-    W : (n, r, n_p) array
-    b : (n, r) array
-        Of the equations, then of the sensors.
-    """
-
-    W: FloatArray
-    b: FloatArray
-
-    @cached_property
-    def has_known_terms(self) -> BoolArray:
-        """Mask ``(r,)`` of the equations in which b is more than a rounding error beside that of another one."""
-        largest = np.abs(self.b).max(axis=0)
-        return np.asarray(largest > _ROUNDING * largest.max())
-
-    def solve(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
-        """Parameters ``(n_sets, n_p)`` by least squares of each set of rows ``(n_sets, n, r)``.
-
-        Rows have residuals of order one; the priors of a layout are further rows.
-        """
-        return _solved(*self._normal_equations(chosen, layout))
-
-    def solve_sized(self, chosen: BoolArray, layout: ParameterLayout | None = None) -> FloatArray:
-        """Parameters as by `solve`, which noise in equations without a known term (``b = 0``) does not shrink.
-
-        Zeros solve such an equation, too: it determines ratios of the parameters that it connects.  Given the ratios,
-        the size of each group of connected parameters is that of least squares of the other equations.
-        """
-        p, known = self.solve(chosen, layout), self.has_known_terms
-        if known.all() or not known.any():
-            return p
-        sized = WeakForm(np.ascontiguousarray(self.W[:, known]), self.b[:, known])
-        G, h = sized._normal_equations(chosen[:, :, known], layout)
-        ratios = p[:, :, None] * _connected(self.W[:, ~known])
-        transposed = ratios.swapaxes(1, 2)
-        sizes = _solved(transposed @ G @ ratios, (transposed @ h[:, :, None])[:, :, 0])
-        return np.asarray((ratios @ sizes[:, :, None])[:, :, 0])
-
-    def _normal_equations(self, chosen: BoolArray, layout: ParameterLayout | None) -> tuple[FloatArray, FloatArray]:
-        """Sums ``(n_sets, n_p, n_p)`` and ``(n_sets, n_p)`` over sets of rows."""
-        n, r, n_p = self.W.shape
-        products = np.einsum("nri,nrj->nrij", self.W, self.W).reshape(n * r, -1)
-        known = (self.W * self.b[:, :, None]).reshape(n * r, -1)
-        G, h = np.empty((len(chosen), n_p, n_p)), np.empty((len(chosen), n_p))
-        at_a_time = max(1, _NUMBERS_AT_A_TIME // (n * r))
-        for first in range(0, len(chosen), at_a_time):
-            some = slice(first, first + at_a_time)
-            masks = chosen[some].reshape(-1, n * r).astype(np.float64)
-            G[some], h[some] = (masks @ products).reshape(-1, n_p, n_p), masks @ known
-        if layout is not None:
-            precision = 1.0 / np.square(layout.prior_std)
-            G, h = G + np.diag(precision), h + precision * layout.prior_mean
-        return G, h
-
-
-def _solved(G: FloatArray, h: FloatArray) -> FloatArray:
-    """Solutions ``(n_sets, n)`` of normal equations; 0 for an unknown that no row has."""
-    d = np.sqrt(np.einsum("kii->ki", G)) + 1e-300
-    G = G / d[:, :, None] / d[:, None, :] + 1e-10 * np.eye(G.shape[-1])
-    return np.asarray(np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d)
-
-
-def _connected(W: FloatArray) -> BoolArray:
-    """Mask ``(n_p, n_groups)`` of the parameters that some equations ``(n, r, n_p)`` connect; others are alone."""
-    used = W.any(axis=0).astype(int)
-    joined = (used.T @ used > 0) | np.eye(used.shape[1], dtype=bool)
-    for _ in range(used.shape[1].bit_length()):
-        joined = joined.astype(int) @ joined > 0
-    return np.asarray(np.unique(joined, axis=0).T)
-
-
-def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> BoolArray:
-    """All rows, and random sets of n to ``largest_sample`` n rows of each equation, with n parameters.
+def random_sets(settings: LoDiransacSettings, weak: Rows, seed: int) -> BoolArray:
+    """All rows, and random sets of n to 4 n rows of each equation, with n parameters.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    weak : WeakForm
+    weak : Rows
     seed : int
         Set k depends on the seed and k alone.
 
@@ -276,9 +162,9 @@ def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> Bool
     """
     n, r, n_p = weak.W.shape
     k = np.arange(settings.n_samples)
-    sizes = _sizes(seed, k, n, n_p, settings.largest_sample)
+    sizes = _sizes(seed, k, n, n_p)
     draws = r * k[:, None] + np.arange(r)
-    most = min(settings.largest_sample * n_p, n)
+    most = min(_LARGEST_SAMPLE * n_p, n)
     rows = sample_rows(seed, draws.ravel(), n, 0, most).reshape(len(k), r, most)
     inside = np.broadcast_to(np.arange(rows.shape[2]) < sizes[:, None, None], rows.shape)
     sample, equation, _ = np.nonzero(inside)
@@ -288,13 +174,13 @@ def random_sets(settings: LoDiransacSettings, weak: WeakForm, seed: int) -> Bool
     return chosen
 
 
-def _sizes(seed: int, k: IntArray, n: int, n_p: int, largest: int) -> IntArray:
-    """Number of rows of samples k: n_p to ``largest`` n_p, of n rows; keys from the end are no sample's."""
-    drawn = sample_rows(seed, ~k.astype(np.uint64), (largest - 1) * n_p + 1, 0, 1)[:, 0]
+def _sizes(seed: int, k: IntArray, n: int, n_p: int) -> IntArray:
+    """Number of rows of samples k: n_p to 4 n_p, of n rows; keys from the end are no sample's."""
+    drawn = sample_rows(seed, ~k.astype(np.uint64), (_LARGEST_SAMPLE - 1) * n_p + 1, 0, 1)[:, 0]
     return np.asarray(np.minimum(n_p + drawn, n))
 
 
-def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
+def weak_form(intervals: ShootingIntervals, motion: Motion) -> Rows:
     """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each.
 
     Parameters
@@ -305,7 +191,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
 
     Returns
     -------
-    WeakForm
+    Rows
     """
     model, H, layout = intervals.model, intervals.length, intervals.layout
     n_p = model.n_p
@@ -326,7 +212,7 @@ def weak_form(intervals: ShootingIntervals, motion: Motion) -> WeakForm:
         means = np.concatenate([windows[firsts[k]] @ bump for k in row_blocks(len(firsts), at_a_time)])
         Ws.append(layout.scattered(means[:, : n_p * r].reshape(-1, n_p, r).swapaxes(1, 2), i))
         bs.append(means[:, n_p * r :])
-    return _scaled(WeakForm(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
+    return _scaled(Rows(np.ascontiguousarray(np.concatenate(Ws)), np.concatenate(bs)), model.n_v)
 
 
 def bump_of(n_rows: int) -> FloatArray:
@@ -355,12 +241,12 @@ def firsts_of(intervals: ShootingIntervals, rows: slice) -> IntArray:
     return np.asarray(rows.start + firsts[gaps[firsts + H] == gaps[firsts]])
 
 
-def _scaled(weak: WeakForm, n_v: int) -> WeakForm:
+def _scaled(weak: Rows, n_v: int) -> Rows:
     """The rows in units of the scales of the n_v equations, and of the sensors after them."""
-    scale = equation_scales(WeakForm(weak.W[:, :n_v], weak.b[:, :n_v]))
+    scale = equation_scales(Rows(weak.W[:, :n_v], weak.b[:, :n_v]))
     sensors = [_sensor_scale(weak.W[:, k], weak.b[:, k]) for k in range(n_v, weak.b.shape[1])]
     scale = np.concatenate([scale, sensors])
-    return WeakForm(weak.W / scale[:, None], weak.b / scale)
+    return weak.over(scale)
 
 
 def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
@@ -369,20 +255,20 @@ def _sensor_scale(W: FloatArray, b: FloatArray) -> float:
     if not used.any():
         return 1.0
     W, b = W[used], b[used]
-    terms = W * np.linalg.lstsq(W, b, rcond=None)[0]
+    terms = W * solve(Rows(W[:, None], b[:, None])).p
     size = np.median(np.sqrt(np.square(terms).sum(axis=1) + np.square(b)))
     return float(max(np.median(np.abs(terms.sum(axis=1) - b)), _SMALL_RESIDUAL * size)) or 1.0
 
 
-def equation_scales(rows: WeakForm) -> FloatArray:
+def equation_scales(rows: Rows) -> FloatArray:
     """Scale of each equation: the median of its residuals, and a hundredth of its terms at least.
 
-    Sizes of the terms of equations without a known term (``b = 0``) are those of `WeakForm.solve_sized`: parameters
+    Sizes of the terms of equations without a known term (``b = 0``) are those of `solve_sized`: parameters
     that such an equation shrinks would shrink its scale, and a smaller scale the parameters.
 
     Parameters
     ----------
-    rows : WeakForm
+    rows : Rows
         Rows in the units of the equations.
 
     Returns
@@ -395,7 +281,7 @@ def equation_scales(rows: WeakForm) -> FloatArray:
     scale = np.where(scale > 0.0, scale, np.abs(rows.b).max(axis=0)) * rows.has_known_terms
     for residuals in (False, False, False, True, True):
         scale = np.where(scale > 0.0, scale, np.inf)
-        terms = rows.W * WeakForm(rows.W / scale[:, None], rows.b / scale).solve_sized(everything)[0]
+        terms = rows.W * solve_sized(rows.over(scale), everything)[0]
         scale = _median_size(np.sqrt(np.square(terms).sum(axis=2) + np.square(rows.b)))
         if residuals:
             scale = np.maximum(_median_size(terms.sum(axis=2) - rows.b), _SMALL_RESIDUAL * scale)
@@ -408,9 +294,7 @@ def _median_size(values: FloatArray) -> FloatArray:
 
 def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
     """Hypotheses clipped to inclusive bounds, without those that violate a strict one."""
-    bounds = intervals.layout.bounds
-    lower = np.array([-np.inf if x.positive else x.lower for x in bounds])
-    p = np.clip(p, lower, np.array([x.upper for x in bounds]))
+    p = np.clip(p, *inclusive_bounds(intervals.layout.bounds))
     return p[intervals.layout.admits(p)]
 
 

@@ -76,7 +76,7 @@ def _estimate_of_log(settings: LoDiransacSettings, one: Dataset, found: Searched
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, p))
     search = LocalSearch(settings, motion, p, prior, None)
     likeliest = search.continued(intervals, fit, found.likeliest)
-    own = Searched(motion, (), 1, likeliest, *parameters_of(settings, likeliest))
+    own = Searched(motion, (), 1, likeliest, *parameters_of(likeliest))
     errors = np.sqrt(np.diag(own.result.covariance))
     errors[one.layout.on_bounds(own.result.parameters)] = np.inf
     late, names = own.common_timing, one.layout.names

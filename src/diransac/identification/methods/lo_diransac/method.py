@@ -25,6 +25,7 @@ from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.checks import findings_of_fit
 from diransac.identification.methods.lo_diransac.competition import compete
 from diransac.identification.methods.lo_diransac.diagnosing import by_acceleration, diagnosis_of
+from diransac.identification.methods.lo_diransac.hypotheses import n_samples
 from diransac.identification.methods.lo_diransac.input_noise import with_accelerations
 from diransac.identification.methods.lo_diransac.logs_alone import estimates_alone
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms, possible_terms
@@ -81,12 +82,8 @@ class LoDiransac(LoDiransacSettings):
         Usual half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
         Cross-validation chooses between it and three, nine, ... times its value, for smoothing also a third of it;
         signals that are sampled more slowly have as many samples of their own.
-    n_samples, n_nonlinear_samples : int, optional
-        Number of random samples of a model that is affine in its parameters, and of others.
-    largest_sample : int, optional
-        Largest number of rows of each equation in a sample, over the number of parameters.
-    n_screening_intervals, n_finalists : int, optional
-        Number of intervals on which all hypotheses are scored; number of hypotheses that are scored on all intervals.
+    n_samples : int, optional
+        Number of random samples of a model that is affine in its parameters; half of it, of others.
     input_delay, input_lag : bool, optional
         Whether inputs act after a delay, or after a first-order lag of the actuators: True, always; False, never; None,
         where that is the likelier explanation of the log.  Where the model is not exact, an actuator may have a lag of
@@ -108,9 +105,6 @@ class LoDiransac(LoDiransacSettings):
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
     prior_discrepancy : float, optional
         Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force.
-    projection : bool, optional
-        Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
-        those of the fit.
     sources : sequence of str, optional
         Sources of estimates besides the joint fit: "least squares", "simulation error".
     start : mapping of str to float, optional
@@ -367,14 +361,13 @@ def _estimate(settings: LoDiransac, found: _Found, end: str, checks: tuple[Findi
     )  # fmt: skip
     covariance = result.covariance + found.ambiguity
     covariance[lost] = covariance[:, lost] = np.inf
-    nonlinear = bool(dataset.model.nonlinear_parameters)
     return Estimate(
         parameters=dict(zip(names, result.parameters.tolist(), strict=True)),
         covariance=covariance,
         degrees_of_freedom=_GAUSSIAN,
         n_fitted=sum(int(np.isfinite(one.measured).any(axis=1).sum()) for one in dataset.segments),
         estimator="multiple shooting",
-        iterations=settings.n_nonlinear_samples if nonlinear else settings.n_samples,
+        iterations=n_samples(settings, dataset.model),
         n_hypotheses=best.n_hypotheses,
         stop_reason=end,
         resolution=found.resolution(forced=settings.forces_timing),

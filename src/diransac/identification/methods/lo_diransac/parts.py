@@ -22,11 +22,12 @@ import numpy as np
 from diransac.arrays import FloatArray, IntArray, size_or_one
 from diransac.identification.core.equations import variances_of_intervals
 from diransac.identification.core.fit import weights_of
+from diransac.identification.core.rows import Rows, solve
 from diransac.identification.estimate import Disagreement
 from diransac.identification.finding import Finding
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
-from diransac.identification.methods.lo_diransac.projection import least_squares_gains, means_of_windows
+from diransac.identification.methods.lo_diransac.projection import means_of_windows
 from diransac.identification.methods.lo_diransac.term_regression import ROUNDING
 from diransac.text_table import number, percent
 
@@ -191,10 +192,9 @@ def _is_no_chance(distance: float, freedom: int) -> bool:
 
 def _change(W: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Change ``(n,)`` of parameters by least squares of some rows, and its variance by batches of them."""
-    gains = least_squares_gains(W, 1.0 / _scales(residuals))
-    change = -np.einsum("pwi,wi->p", gains, residuals)
-    sums = batch_sums(np.einsum("pwi,wi->wp", gains, residuals + W @ change))
-    return change, np.square(sums).sum(axis=0) / _free(W)
+    solution = solve(Rows(W, -residuals), 1.0 / _scales(residuals))
+    sums = batch_sums(np.einsum("pwi,wi->wp", solution.gains, solution.rows.residuals(solution.p)))
+    return solution.p, np.square(sums).sum(axis=0) / _free(W)
 
 
 def _free(W: FloatArray) -> float:

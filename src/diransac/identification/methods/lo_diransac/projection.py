@@ -36,10 +36,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.identification.core.equations import effect_on, linearize
 from diransac.identification.core.fit import weights_of
-from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
+from diransac.identification.core.rows import CAUCHY, Loss, Rows, inclusive_bounds, solve
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
@@ -53,13 +53,10 @@ if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
     from diransac.identification.core.windows import ShootingIntervals
 
-_TINY = 1e-300
-# Factor of the standard deviations of priors in the covariance that is combined with them.
 _WIDER = 100.0
-# Equations per parameter in the longest windows.
+"""Factor of the standard deviations of priors in the covariance that is combined with them."""
 _EQUATIONS = 8
-# Steps of reweighting, the width of Cauchy's loss in standard deviations, and what is rounding of an equation's scale.
-_REWEIGHTED, _CAUCHY, _ROUNDING = 4, 2.385, 1e-9
+"""Equations per parameter in the longest windows."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,7 +131,7 @@ def projected_candidates(
     wide = _with_wide_priors(intervals, fit)
     now, rows = wide.shared[: intervals.n_p], _Rows.of(intervals, wide)
     for windows in _windows(intervals, len(now), rows.latent.shape[1]):
-        p, gains, _ = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
+        p, gains, _ = _bounded_projection(intervals, now, rows, windows, CAUCHY)
         seconds = intervals.duration * float(np.diff(windows, append=len(intervals)).max())
         parts = _parts(intervals, rows, gains)
         del gains  # of every row: found again for an estimate that is asked for
@@ -174,7 +171,7 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
         Within the inclusive bounds.
     """
     now, rows = fit.shared[: intervals.n_p], _Rows.of(intervals, fit)
-    return _bounded_projection(intervals, now, rows, np.arange(len(intervals)), _REWEIGHTED)[0]
+    return _bounded_projection(intervals, now, rows, np.arange(len(intervals)), CAUCHY)[0]
 
 
 def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
@@ -194,7 +191,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     """
     effect = effect_of_intervals(intervals, fit)
     scatter = np.square(batch_sums(effect.steps)).sum(axis=0)
-    more = np.sqrt(np.maximum(1.0, scatter / (np.diag(effect.covariance) + _TINY)))
+    more = np.sqrt(np.maximum(1.0, scatter / (np.diag(effect.covariance) + np.finfo(float).tiny)))
     p = fit.shared[: intervals.n_p]
     covariance = effect.covariance * np.outer(more, more) + effect_on(intervals, fit, effect.z, effect.s)
     left, windows = unexplained(intervals, fit, p), np.arange(len(intervals))
@@ -289,8 +286,8 @@ def _solution(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntA
     interval means.
     """
     now = fit.shared[: intervals.n_p]
-    p, gains, stuck = _bounded_projection(intervals, now, rows, windows, _REWEIGHTED)
-    plain = _bounded_projection(intervals, now, rows, windows, 0)[0]
+    p, gains, stuck = _bounded_projection(intervals, now, rows, windows, CAUCHY)
+    plain = _bounded_projection(intervals, now, rows, windows, None)[0]
     slopes = _slopes(intervals, fit, rows, gains)
     covariance = _covariance_of_fit(intervals, fit, *slopes)
     sums = batch_sums(_parts(intervals, rows, gains))
@@ -332,22 +329,21 @@ def _parts(intervals: ShootingIntervals, rows: _Rows, gains: tuple[FloatArray, F
 
 
 def _bounded_projection(
-    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, windows: IntArray, reweighted: int
+    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, windows: IntArray, loss: Loss | None
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
     Arguments are the parameters of the fit, the equations on its motion, the first intervals of the windows over which
-    these are averaged, and the number of steps of reweighting.
+    these are averaged, and a loss.
     """
-    lower = np.array([-np.inf if x.positive else x.lower for x in intervals.layout.bounds])
-    upper = np.array([x.upper for x in intervals.layout.bounds])
+    lower, upper = inclusive_bounds(intervals.layout.bounds)
     stuck, p = np.zeros(len(now), bool), now
     for _ in range(len(now) + 1):
         free = ~stuck
         left = rows.latent * rows.attributed + rows.means[:, :, stuck] @ (p - now)[stuck]
         known = rows.means[:, :, free] @ now[free] - left - means_of_intervals(intervals, rows.push)
         gains = tuple(np.zeros((len(now), *x.shape[:2])) for x in (rows.W, rows.means))
-        for gain, one in zip(gains, _gains(intervals, rows, free, known, windows, reweighted), strict=True):
+        for gain, one in zip(gains, _gains(intervals, rows, free, known, windows, loss), strict=True):
             gain[free] = one
         found = now - np.einsum("pni,ni->p", gains[0], rows.push) - np.einsum("pwi,wi->p", gains[1], left)
         p = np.where(stuck, p, found)
@@ -359,22 +355,24 @@ def _bounded_projection(
 
 
 def _gains(
-    intervals: ShootingIntervals, rows: _Rows, free: BoolArray, known: FloatArray, windows: IntArray, reweighted: int
+    intervals: ShootingIntervals, rows: _Rows, free: BoolArray, known: FloatArray, windows: IntArray, loss: Loss | None
 ) -> tuple[FloatArray, FloatArray]:
     """Effects on the free parameters of every row (n, N, n_v), and of every interval (n, W, n_v).
 
-    Equations of intervals have the known sides ``known (W, n_v)``.
+    Equations of intervals have the known sides ``known (W, n_v)``.  Scales are inertial forces, so that unmodelled
+    accelerations count by their share of the motion: an equation that is wrong throughout, as by the gain of its input,
+    has its say on the parameters that it shares with others.  A gust of a second, or friction where it changes sign, is
+    no reason to change the parameters of the whole motion.
     """
-    if len(windows) == len(intervals):
-        weak = WeakForm(rows.means[:, :, free], known)
-        weights = _robust_weights(weak, intervals.occupied, _rms(rows.inertial), reweighted)
-        every = np.repeat(weights, intervals.length, axis=0)
-        return least_squares_gains(rows.W[:, :, free], every), least_squares_gains(weak.W, weights)
     W, b, inertial = (means_of_windows(x, windows) for x in (rows.means[:, :, free], known, rows.inertial))
-    sizes = np.diff(windows, append=len(intervals))
     occupied = np.logical_or.reduceat(intervals.occupied, windows)
-    gains = least_squares_gains(W, _robust_weights(WeakForm(W, b), occupied, _rms(inertial), reweighted))
-    of_intervals = np.repeat(gains / sizes[:, None], sizes, axis=1)
+    weights = occupied[:, None] / size_or_one(np.sqrt(np.square(inertial).mean(axis=0)))
+    solution = solve(Rows(W, b), weights, loss=loss)
+    if len(windows) == len(intervals):
+        every = np.repeat(solution.weights, intervals.length, axis=0)
+        return solve(Rows(rows.W[:, :, free], rows.push), every).gains, solution.gains
+    sizes = np.diff(windows, append=len(intervals))
+    of_intervals = np.repeat(solution.gains / sizes[:, None], sizes, axis=1)
     return np.repeat(of_intervals / intervals.length, intervals.length, axis=1), of_intervals
 
 
@@ -399,51 +397,3 @@ def means_of_windows(values: FloatArray, windows: IntArray) -> FloatArray:
 def _over_windows(values: FloatArray, windows: IntArray) -> FloatArray:
     """The mean of its window in every interval (W, n)."""
     return np.repeat(means_of_windows(values, windows), np.diff(windows, append=len(values)), axis=0)
-
-
-def _rms(inertial: FloatArray) -> FloatArray:
-    """Inertial force of each equation; 1 for one without."""
-    scale = np.sqrt(np.square(inertial).mean(axis=0))
-    return np.where(scale > 0.0, scale, 1.0)
-
-
-def _robust_weights(rows: WeakForm, occupied: BoolArray, scale: FloatArray, steps: int) -> FloatArray:
-    """Square roots of the weights ``(W, n_v)``: of the equations by their scales, and of intervals by Cauchy's loss.
-
-    Scales are inertial forces, so that unmodelled accelerations count by their share of the motion: an equation that is
-    wrong throughout, as by the gain of its input, has its say on the parameters that it shares with others.  A gust of
-    a second, or friction where it changes sign, is no reason to change the parameters of the whole motion.
-    """
-    loss = np.ones(rows.b.shape)
-    for _ in range(steps):
-        gains = least_squares_gains(rows.W, loss / scale)
-        left = rows.b - rows.W @ np.einsum("pwi,wi->p", gains, rows.b)
-        spread = robust_std(left[occupied], axis=0)
-        loss = 1.0 / np.sqrt(1.0 + np.square(left / (_CAUCHY * np.maximum(spread, _ROUNDING * scale))))
-    return np.asarray(loss / scale)
-
-
-def least_squares_gains(W: FloatArray, weights: FloatArray) -> FloatArray:
-    """``(W'VW)^-1 W'V`` of stacked matrices: the effect of each row of each equation on the parameters.
-
-    Parameters
-    ----------
-    W : (N, r, n) array
-    weights : (N, r) or (r,) array
-        Square roots of the diagonal of V.
-
-    Returns
-    -------
-    (n, N, r) array
-    """
-    weights = np.broadcast_to(weights, W.shape[:2])
-    rows = (W * weights[:, :, None]).reshape(W.shape[0] * W.shape[1], W.shape[2])
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0.0] = 1.0
-    rows = rows / scale
-    normal = rows.T @ rows
-    if not np.isfinite(normal).all():  # LAPACK would print to the terminal
-        raise np.linalg.LinAlgError("the regressors of the fitted motion are not finite")
-    inverse = np.linalg.lstsq(normal, np.eye(len(normal)), rcond=None)[0]
-    solved = (inverse / scale[:, None]) @ rows.T
-    return np.asarray(solved.reshape(-1, *W.shape[:2]) * weights)

@@ -14,7 +14,7 @@ from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.core.minimise import diverges, make_prior, start
 from diransac.identification.method import report, within
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import AS_LIKELY, LATE, LocalSearch
 from diransac.identification.methods.lo_diransac.motion_equations import discrepancy_units, residuals_of_motion
 from diransac.identification.methods.lo_diransac.projection import (
@@ -244,12 +244,8 @@ def searched(
     """A search that begins with a motion, and with hypotheses or samples; a rival may end it early."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
-    n_spikes = 0
     if hypotheses is None:
         hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
-        intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
-    if n_spikes:
-        notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, hypotheses[0]))
     able = next((p for p in hypotheses if not diverges(start(settings, intervals, motion, p, prior))), None)
     if able is None:
@@ -259,19 +255,18 @@ def searched(
         )
     search = LocalSearch(settings, motion, able, prior, callback)
     likeliest = search.likeliest(intervals, free_hold=dataset.input_hold is None, rival=rival)
-    return Searched(motion, notes, len(hypotheses), likeliest, *parameters_of(settings, likeliest))
+    return Searched(motion, notes, len(hypotheses), likeliest, *parameters_of(likeliest))
 
 
-def parameters_of(settings: LoDiransacSettings, likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
+def parameters_of(likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str, ...]]:
     """Parameters of an explanation: the fit's where others would violate strict bounds, with the names of these.
 
     Parameters
     ----------
-    settings : LoDiransacSettings
     likeliest : Explanation
     """
     intervals, fit = likeliest.intervals, likeliest.refinement.fit
-    if likeliest.exact or not settings.projection:
+    if likeliest.exact:
         return fitted_parameters(intervals, fit), ()
     result, layout = estimate_parameters(intervals, fit), intervals.layout
     impossible = layout.violations(result.parameters)

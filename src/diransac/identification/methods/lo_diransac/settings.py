@@ -33,10 +33,6 @@ class LoDiransacSettings:
     median_window: float = 0.31
     smoothing_half_width: float = 0.25
     n_samples: int = 200
-    n_nonlinear_samples: int = 100
-    largest_sample: int = 4
-    n_screening_intervals: int = 12
-    n_finalists: int = 12
     input_delay: bool | None = None
     input_lag: bool | None = None
     sensor_delays: tuple[str, ...] | None = None
@@ -48,7 +44,6 @@ class LoDiransacSettings:
     model_error: bool = True
     prior_model_error: float = 1e-3
     prior_discrepancy: float = 0.1
-    projection: bool = True
     sources: tuple[str, ...] = SOURCES
     start: Mapping[str, float] | None = None
     horizon: float | None = None
