@@ -90,7 +90,6 @@ def _parts() -> dict[str, Part]:
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
         ),
         "screening": Part(replace(DEFAULT, stuck_rows=False)),
-        "spikes of inputs": Part(patches=(("search.find_spikes", lambda s, i, m, h, *_: (i, h, 0)),)),
         "projection": Part(replace(DEFAULT, projection=False)),
         "robust loss of the projection": Part(patches=(("projection._REWEIGHTED", 0),)),
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),

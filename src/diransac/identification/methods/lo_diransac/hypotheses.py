@@ -21,7 +21,6 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, row_blocks
 from diransac.identification.methods.lo_diransac.mixture import lower_scale
-from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import RolloutBatch, rollouts
@@ -40,8 +39,6 @@ _NUMBERS_AT_A_TIME = 1_000_000
 _SMALL_RESIDUAL = 0.01
 # Known terms that are as small beside those of another equation are rounding errors.
 _ROUNDING = 1e-9
-# Decrease of the log residuals of each signal by which inputs without spikes are those that acted.
-_CLEAR_GAIN = float(np.log(1.25))
 
 
 def find_hypotheses(
@@ -73,56 +70,6 @@ def find_hypotheses(
         return finalists
     scores = robust_scores(intervals, motion, finalists, np.arange(len(intervals)))
     return finalists[np.argsort(scores, kind="stable")[: np.isfinite(scores).sum()]]
-
-
-def find_spikes(
-    settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
-    motion: Motion,
-    hypotheses: FloatArray,
-    seed: int,
-    dataset: Dataset,
-) -> tuple[ShootingIntervals, FloatArray, int]:
-    """The intervals without spikes of the inputs, where simulations agree better with the logs then.
-
-    A controller's spikes act on the machine, those of a torque sensor do not; both look alike.  Where simulations by
-    the best hypothesis agree less well without them, they act, and no other hypotheses are sought.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    hypotheses : (n_hypotheses, n) array
-        Of these intervals, best first.
-    seed : int
-    dataset : Dataset
-
-    Returns
-    -------
-    intervals : ShootingIntervals
-    hypotheses : (n_hypotheses, n) array
-        Best first.
-    n_spikes : int
-        Number of rows with spikes; 0 for the given intervals.
-    """
-    cleaned = [without_spikes(intervals.recorded[rows], settings.input_threshold) for rows in intervals.rows_of_logs]
-    n_spikes = sum(n for _, n in cleaned)
-    if not n_spikes:
-        return intervals, hypotheses, 0
-    trial = replace(intervals, recorded=np.concatenate([u for u, _ in cleaned]))
-
-    def scores(hypothesis: FloatArray) -> FloatArray:
-        every = np.arange(len(intervals))
-        return np.array([robust_scores(x, motion, hypothesis, every)[0] for x in (intervals, trial)])
-
-    known = scores(hypotheses[:1])
-    if known[1] >= known[0] or not len(found := find_hypotheses(settings, trial, motion, seed, dataset)):
-        return intervals, hypotheses, 0
-    before, after = np.minimum(known, scores(found[:1]))
-    is_better = before - after > _CLEAR_GAIN * intervals.known.any(axis=0).sum()
-    return (trial, found, n_spikes) if is_better else (intervals, hypotheses, 0)
 
 
 def _linear(

@@ -13,7 +13,7 @@ from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.method import report, within
-from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses, find_spikes
+from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import AS_LIKELY, LATE, LocalSearch
 from diransac.identification.methods.lo_diransac.motion_equations import discrepancy_units, residuals_of_motion
 from diransac.identification.methods.lo_diransac.projection import (
@@ -244,12 +244,8 @@ def searched(
     """A search that begins with a motion, and with hypotheses or samples; a rival may end it early."""
     report(callback, "drawing hypotheses", 0.1)
     check_time()
-    n_spikes = 0
     if hypotheses is None:
         hypotheses = _hypotheses(settings, intervals, motion, seed, dataset)
-        intervals, hypotheses, n_spikes = find_spikes(settings, intervals, motion, hypotheses, seed, dataset)
-    if n_spikes:
-        notes += (f"inputs have spikes in {n_spikes} rows, with which simulations fit worse; they are interpolated",)
     prior = make_prior(settings, intervals, motion, discrepancy_units(intervals, motion, hypotheses[0]))
     able = next((p for p in hypotheses if not diverges(start(settings, intervals, motion, p, prior))), None)
     if able is None:
