@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import BoolArray, FloatArray, robust_std
 from diransac.data.dataset import Dataset
+from diransac.data.filters import median_filter
 from diransac.errors import LogError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.screening import without_spikes
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.model import Model
 
@@ -98,12 +98,23 @@ def predicted_forces(
         q, v, a, _ = motion.parts(model, logged)
         recorded = intervals.recorded[logged]
         u = _acting(recorded, resolution, one.log.dt)
-        commanded, _ = without_spikes(recorded, LoDiransac().input_threshold)
+        commanded = _without_spikes(recorded)
         clean = np.isclose(u, _acting(commanded, resolution, one.log.dt)).all(axis=1)
         p = np.repeat(model.parameter_vector(own)[:, None], len(one), axis=1)
         rest, errors = (np.array(model.residual(q.T, v.T, a.T, x.T, p)).T for x in (_without_force(model, q, v, u), u))
         found.append(PredictedForces(v, rest - errors, errors, clean & intervals.counted[logged]))
     return found
+
+
+def _without_spikes(inputs: FloatArray) -> FloatArray:
+    """Inputs ``(N, n_u)`` whose spikes of one or two samples are medians of five, where they have noise at all.
+
+    The noise is white in second differences; a median of five differs from the middle by eight of it at a spike alone.
+    """
+    if len(inputs) < 5:
+        return inputs
+    noise, median = robust_std(np.diff(inputs, 2, axis=0), axis=0) / np.sqrt(6.0), median_filter(inputs, 5)
+    return np.where((noise > 0.0) & (np.abs(inputs - median) > 8.0 * noise), median, inputs)
 
 
 def _acting(inputs: FloatArray, resolution: Resolution, dt: float) -> FloatArray:
