@@ -100,7 +100,6 @@ def _parts() -> dict[str, Part]:
         "outliers by predictions": Part(patches=(("forward.Forward.compared", _with_outliers_of_the_fit),)),
         "prediction of forces": Part(patches=(("judge._EXPLAINED", 0.0),)),
         "prediction of whole logs": Part(patches=(("forward._LONGEST", 0),)),
-        "exact fits that cannot win end early": Part(patches=(("refinement._is_lost", lambda *_: False),)),
         "second-order correction of steps": Part(patches=(("gauss_newton._CORRECTED", 0.0),)),
         "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),
     }

@@ -427,14 +427,9 @@ def test_a_corrected_step_keeps_to_tight_continuity_along_curved_rollouts(late):
     at = JointEquations.of(intervals, fit, intervals.all_errors.kinds)
     weights = at.of_fit.weights
 
-    def after(right):
-        step = at.step(right)
-        there = at.moved(step)
-        return step, there, moved(there, fit, step.of_fit.step_z, step.of_fit.step_p)
-
-    step, there, plain = after(at.right)
-    assert bool(step.sizes.any()) == late
-    _, then, corrected = after(at.corrected(there, plain, step))
+    there, plain = at.moved(at.solve())
+    assert (there is not intervals) == late
+    then, corrected = at.moved(at.solve(at.corrected(there, plain)))
     broken, kept, best = cost(there, plain, weights), cost(then, corrected, weights), cost(intervals, fit, weights)
     assert kept < 0.01 * broken
     assert (weights * np.square(corrected.residuals)).sum() < 1.1 * (weights * np.square(plain.residuals)).sum()
@@ -460,7 +455,7 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
     assert cost(step.intervals, step.fit, weights) < before
     assert step.taken is None
     np.testing.assert_allclose(step.damping, following)
-    np.testing.assert_array_equal(step.solved.var_p, at.step(at.right).of_fit.var_p)
+    np.testing.assert_array_equal(step.solved.var_p, at.solve().var_p)
 
 
 def test_a_step_is_compared_with_no_step_where_fractions_of_a_sample_were_corrected_by_the_rates_of_another_fit():
@@ -469,8 +464,8 @@ def test_a_step_is_compared_with_no_step_where_fractions_of_a_sample_were_correc
     other = replace(fit, x=fit.x + 0.3, shared=0.5 * fit.shared)
     intervals = intervals.corrected({late: 0.4}, signal_rates(intervals, with_residuals(intervals, other)))
     at = JointEquations.of(intervals, with_residuals(intervals, fit), (late,))
-    step = at.step(at.right)
-    there = at.moved(replace(step, sizes=1e-9 * step.sizes))
+    step = at.solve()
+    there, _ = at.moved(replace(step, step_p=np.append(0.0 * step.step_p[:-1], 1e-9 * step.step_p[-1])))
     before, after = (
         cost(x, y, at.of_fit.weights) for x, y in ((at.intervals, at.fit), (there, with_residuals(there, at.fit)))
     )
@@ -483,7 +478,7 @@ def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
     kinds = (intervals.all_inputs("delay"), ErrorKind((4,), "bias"), ErrorKind((2,), "delay"))
     at = JointEquations.of(intervals, fit, kinds)
-    system, (right_z, right_s, right_e) = at.of_fit.system, at.right
+    system, (right_z, right_s) = at.system, at.right
     n, k = right_z.size, right_z.shape[1]
     A = np.zeros((n + len(right_s), n + len(right_s)))
     for w in range(len(intervals)):
@@ -493,16 +488,31 @@ def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():
             A[own, (w - 1) * k : w * k] = system.below[w - 1]
             A[(w - 1) * k : w * k, own] = system.below[w - 1].T
     A[n:, :n], A[n:, n:] = A[:n, n:].T, system.corner
-    of = np.vstack([at.of_z.reshape(n, -1), at.of_s])
-    whole = np.block([[A, of], [of.T, at.information]])
-    unit = 1.0 / np.sqrt(np.diag(whole))
-    right = np.concatenate([right_z.ravel(), right_s, right_e])
-    solution = unit * np.linalg.solve(unit[:, None] * whole * unit, unit * right)
-    found = at.step(at.right)
-    assert found.sizes == pytest.approx(solution[-3:], rel=1e-4)
-    expected, scale = solution[:-3], 1.0 / np.sqrt(np.diag(A))
-    off = (np.append(found.of_fit.step_z, found.of_fit.step_p) - expected) / scale
-    assert np.abs(off).max() < 1e-3 * np.abs(expected / scale).max()
+    unit = 1.0 / np.sqrt(np.diag(A))
+    right = np.concatenate([right_z.ravel(), right_s])
+    solution = unit * np.linalg.solve(unit[:, None] * A * unit, unit * right)
+    found = at.solve()
+    assert at.errors_of(found)[0] == pytest.approx(solution[-3:], rel=1e-4)
+    off = (np.append(found.step_z, found.step_p) - solution) / unit
+    assert np.abs(off).max() < 1e-3 * np.abs(solution / unit).max()
+
+
+def test_an_error_of_a_recording_in_the_border_is_the_schur_complement():
+    """Step and information of the errors are those that follow from the fit's own system alone."""
+    intervals, signals = intervals_of(n_rows=200)
+    fit = with_residuals(intervals, perturbed_fit(intervals, signals))
+    at = JointEquations.of(intervals, fit, (intervals.all_inputs("delay"), ErrorKind((4,), "bias")))
+    columns, n_s = at.columns, len(fit.shared)
+    z, s = at.of_fit.system.functional(columns.of_z, columns.of_s)
+    left = at.system.corner[n_s:, n_s:] - np.einsum("wke,wkf->ef", columns.of_z, z) - columns.of_s.T @ s
+    right_z, right = at.right
+    score = right[n_s:] - np.einsum("wke,wk->e", z, right_z) - s.T @ right[:n_s]
+    sizes, std, covariance = at.errors_of(at.solve())
+    np.testing.assert_allclose(sizes, np.linalg.solve(left, score), rtol=1e-9)
+    np.testing.assert_allclose(covariance, np.linalg.inv(left), rtol=1e-9)
+    np.testing.assert_allclose(np.square(std), np.diag(covariance))
+    alone = at.of_fit.system.solve(right_z, right[:n_s])
+    np.testing.assert_allclose(at.solve().step_p[:n_s], alone.step_p - s @ sizes, rtol=1e-7)
 
 
 def test_a_late_recording_of_the_inputs_is_an_unknown_of_the_fit():

@@ -16,7 +16,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
-from diransac.identification.methods.lo_diransac.gauss_newton import bounded, linearized
+from diransac.identification.methods.lo_diransac.joint_equations import bounded, linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.refinement import diverges, negative_log_evidence

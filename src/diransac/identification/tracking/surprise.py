@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
+from diransac.identification.methods.lo_diransac.joint_equations import linearized
 from diransac.identification.methods.lo_diransac.normal_equations import weights_of
 
 if TYPE_CHECKING:

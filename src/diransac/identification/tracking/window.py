@@ -11,7 +11,8 @@ import numpy as np
 
 from diransac.arrays import FloatArray, size_or_one
 from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
+from diransac.identification.methods.lo_diransac.joint_equations import linearized
 from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
 from diransac.identification.methods.lo_diransac.scales import (

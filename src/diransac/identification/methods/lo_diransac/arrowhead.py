@@ -100,6 +100,12 @@ class Arrowhead:
     corner: FloatArray
     ridge: float = _RIDGE
 
+    @property
+    def ridged(self) -> FloatArray:
+        """D ``(W, k, k)`` with the ridge."""
+        own = np.einsum("wii->wi", self.diagonal)
+        return self.diagonal + (self.ridge * _size(own))[:, :, None] * np.eye(own.shape[1])
+
     def solve(self, right_z: FloatArray, right_p: FloatArray, damping: float = 0.0) -> Factored:
         """Solution for one right-hand side, or for c.
 

@@ -55,7 +55,8 @@ class AugmentedModel:
     def unknowns(self) -> tuple[str, ...]:
         """The unknowns of an interval: its state, accelerations or errors, and those that intervals share."""
         names = tuple(self.model.parameters)
-        return (*self.model.state, *names[-self.n_latent :], *names[: -self.n_latent])
+        last = len(names) - self.n_latent
+        return (*self.model.state, *names[last:], *names[:last])
 
 
 @lru_cache(maxsize=16)

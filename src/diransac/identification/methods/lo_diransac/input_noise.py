@@ -12,8 +12,7 @@ Fuller 1987 (errors in variables).
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +25,7 @@ from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import linearize, split, weights_of, with_residuals
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters
-from diransac.identification.methods.lo_diransac.refinement import Refinement, refine_by
+from diransac.identification.methods.lo_diransac.refinement import Refinement, minimise
 from diransac.identification.methods.lo_diransac.scales import CONTINUITY, SHRINK, negligible_jumps, process_sums
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def refine_noisy(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     least, unbroken = _NONE * _sizes(intervals), negligible_jumps(intervals, prior.exact)
     if not intervals.noisy:
         intervals, fit = _with_errors(intervals, fit)
-    return refine_by(settings, intervals, fit, partial(_update, settings, least, unbroken))
+    return minimise(intervals, fit, Noisy(settings, least, unbroken), settings.max_steps)
 
 
 def _sizes(intervals: ShootingIntervals) -> FloatArray:
@@ -103,15 +102,25 @@ def _with_errors(intervals: ShootingIntervals, fit: Fit) -> tuple[ShootingInterv
     return finer, with_residuals(finer, fit)
 
 
-def _update(settings: LoDiransacSettings, least: FloatArray, unbroken: FloatArray, taken: Step) -> Fit:
-    """The fit after a step with every scale updated from residuals and errors of inputs."""
-    intervals, fit = taken.intervals, taken.fit
-    noise = fit.noise.of_sums(_noise_sums(taken), outliers=settings.outliers)
-    sums, n_x = process_sums(intervals, fit, taken.solved).total(), fit.x.shape[1]
-    tau = np.maximum(sums.most_probable_size(np.zeros_like(fit.tau), fit.tau), least / np.sqrt(intervals.length))
-    by_errors = taken.at.of_fit.slopes[:, :, n_x : n_x + len(tau)] * tau
-    jumps = np.maximum(unbroken, CONTINUITY * np.sqrt(np.square(by_errors).sum(axis=2).mean(axis=0)))
-    return replace(fit, noise=noise, tau=tau, continuity_std=np.maximum(jumps, SHRINK * fit.continuity_std))
+@dataclass(frozen=True, eq=False, repr=False)
+class Noisy:
+    """Schedule of the exact model with noise of inputs; least noise of inputs, and least jumps."""
+
+    settings: LoDiransacSettings
+    least: FloatArray
+    unbroken: FloatArray
+    settled = 0.01
+
+    def after(self, step: Step) -> Fit:
+        """The fit with every scale updated from residuals and errors of inputs."""
+        intervals, fit = step.intervals, step.fit
+        noise = fit.noise.of_sums(_noise_sums(step), outliers=self.settings.outliers)
+        sums, n_x = process_sums(intervals, fit, step.solved).total(), fit.x.shape[1]
+        tau = sums.most_probable_size(np.zeros_like(fit.tau), fit.tau)
+        tau = np.maximum(tau, self.least / np.sqrt(intervals.length))
+        by_errors = step.at.of_fit.slopes[:, :, n_x : n_x + len(tau)] * tau
+        jumps = np.maximum(self.unbroken, CONTINUITY * np.sqrt(np.square(by_errors).sum(axis=2).mean(axis=0)))
+        return replace(fit, noise=noise, tau=tau, continuity_std=np.maximum(jumps, SHRINK * fit.continuity_std))
 
 
 def _noise_sums(taken: Step) -> NoiseSums:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import row_blocks
-from diransac.identification.methods.lo_diransac.gauss_newton import after_step
+from diransac.identification.methods.lo_diransac.joint_equations import bounded
 from diransac.identification.methods.lo_diransac.normal_equations import (
     linearize,
     weights_of,
@@ -54,8 +54,15 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
         step, cost = answer(intervals, at, accurate, other)
         change = np.abs(step.step_p) / np.sqrt(np.diag(step.var_p))
         if (change[: intervals.n_p] < _NEGLIGIBLE).all() and abs(cost) < _NEGLIGIBLE_COST:
-            return other, after_step(other, fit, step)
+            return other, _after_step(other, fit, step)
     return finest, accurate
+
+
+def _after_step(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
+    """The fit after a step within the bounds, simulated over some intervals."""
+    shared, n_x = bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
+    z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
+    return with_residuals(intervals, replace(fit, shared=shared, x=fit.x + z[:, :n_x], d=fit.d + z[:, n_x:]))
 
 
 def answer(

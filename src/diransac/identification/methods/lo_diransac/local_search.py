@@ -21,7 +21,6 @@ from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.corrections import ErrorKind
-from diransac.identification.methods.lo_diransac.gauss_newton import linearized
 from diransac.identification.methods.lo_diransac.input_noise import (
     averaged_noise,
     explains_all,
@@ -31,7 +30,7 @@ from diransac.identification.methods.lo_diransac.input_noise import (
     simpler_timings,
 )
 from diransac.identification.methods.lo_diransac.integration_steps import answer, with_fewest_steps
-from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
+from diransac.identification.methods.lo_diransac.joint_equations import RecordingError, linearized
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters, projected_parameters
@@ -377,7 +376,7 @@ class LocalSearch:
         if kept and intervals.hold == now.intervals.hold:
             return replace(now, refinement=refine_further(self.settings, intervals, begin))
         # Inputs that act otherwise move the motion by far more than its scales.
-        return replace(now, refinement=refine_exact(self.settings, intervals, begin, self.prior, now.cost))
+        return replace(now, refinement=refine_exact(self.settings, intervals, begin, self.prior))
 
     def _better(
         self,
@@ -490,7 +489,7 @@ class LocalSearch:
         """
         intervals = replace(intervals, substeps=self.settings.substeps)
         try:
-            refined = refine_exact(self.settings, intervals, begin, self.prior, rival.cost)
+            refined = refine_exact(self.settings, intervals, begin, self.prior)
         except np.linalg.LinAlgError:
             return None
         return replace(rival, refinement=refined, exact=True)

@@ -6,7 +6,7 @@ state x_w and an unmodelled acceleration d_w that acts over the interval.  With 
 discrepancies), twice the cost is
 
     sum W |y - y(x_w, s, d_w)|^2 + sum |x_{w+1} - F(x_w, s, d_w)|^2 / kappa^2 + sum |e_w|^2 / tau^2
-        + |s - m|^2 / prior^2
+        + |s - m|^2 / prior^2 + sum |x_w - m_w|^2 / s_w^2
 
 and where a fit begins with a window of a log, that of its `BoundaryPrior`, which includes ``e_0``.  The second sum
 is over neighbours within one log.  Unmodelled accelerations are a first-order Gauss-Markov process:
@@ -19,7 +19,7 @@ Bock 1987 (multiple shooting); Tremolet 2006 (weak-constraint 4D-Var).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,6 +68,9 @@ class Fit:
         Prior means of the parameters; zero for the others.
     boundary : BoundaryPrior, optional
         What is known from before the first interval; None where nothing is.
+    x_mean : (W, n_x) or (1, n_x) array
+    x_std : (n_x,) array
+        Gaussian prior of the states; infinite deviations without one.
     """
 
     shared: FloatArray
@@ -82,6 +85,8 @@ class Fit:
     prior: FloatArray
     prior_mean: FloatArray
     boundary: BoundaryPrior | None = None
+    x_mean: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    x_std: FloatArray = field(default_factory=lambda: np.full(1, np.inf))
 
     @property
     def at_boundary(self) -> FloatArray:
@@ -256,6 +261,8 @@ def linearize(
     F = sums.final_slopes[:-1]
     linked = intervals.linked
     jumps = fit.jumps(intervals)
+    np.einsum("wii->wi", H)[:, :n_x] += fit.x_std**-2.0
+    g[:, :n_x] -= (fit.x - fit.x_mean) * fit.x_std**-2.0
     F = F if linked.all() else np.where(linked[:, None, None], F, 0.0)
     precision = linked[:, None] / np.square(fit.continuity_std)
     FP = F.swapaxes(1, 2) * precision[:, None, :]
@@ -292,6 +299,33 @@ def linearize(
     system = Arrowhead(*blocks, _FINE_RIDGE) if has_prior else Arrowhead(*blocks)
     of_jumps = jumps, F, precision
     return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, *of_jumps, corners, rights, sums.along)
+
+
+def without_windows(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of the shared unknowns, the right-hand side last, when windows that nothing ties are eliminated.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+    at : NormalEquations
+
+    Returns
+    -------
+    (W, n_s, n_s + 1) array
+        Of each window.
+    (n_s, n_s + 1) array
+        Of the priors.
+    """
+    right = np.concatenate([at.system.border, at.right_z[:, :, None]], axis=2)
+    solved = np.linalg.solve(at.system.ridged, right)
+    parts = -at.system.border.swapaxes(1, 2) @ solved
+    n, places = np.arange(len(parts)), _places(intervals)[intervals.log_of]
+    own = np.concatenate([at.corners, at.rights[:, :, None]], axis=2)
+    columns = np.concatenate([places, np.full((len(n), 1), intervals.n_shared)], axis=1)
+    parts[n[:, None, None], places[:, :, None], columns[:, None, :]] += own
+    precision = np.square(fit.prior) ** -1.0
+    return parts, np.column_stack([np.diag(precision), -precision * (fit.shared - fit.prior_mean)])
 
 
 def variances_of_intervals(
@@ -471,6 +505,7 @@ def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
         np.square(fit.jumps(intervals) / fit.continuity_std).sum(),
         np.square(innovations(intervals, fit)).sum(),
         np.square((fit.shared - fit.prior_mean) / fit.prior).sum(),
+        np.square((fit.x - fit.x_mean) / fit.x_std).sum(),
         0.0 if fit.boundary is None else fit.boundary.cost(fit.at_boundary),
     )
     total = float(sum(terms))

@@ -17,7 +17,7 @@ from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.joint_equations import (
     JointEquations,
     RecordingError,
-    Scores,
+    errors_tested,
     is_possible,
     signal_rates,
 )
@@ -63,12 +63,10 @@ def clear_errors(
     list of RecordingError
         Empty if no error is clear.
     """
-    scores, at_a_time = Scores(intervals, fit), max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
-    parts = [tested[k : k + at_a_time] for k in range(0, len(tested), at_a_time)]
-    found = [x for part in parts for x in scores.tested(part)]
+    at_a_time = max(1, _NUMBERS_AT_A_TIME // intervals.measured.size)
     found = [
         x
-        for x in found
+        for x in errors_tested(intervals, fit, tested, at_a_time)
         if is_possible(intervals, x.kind, x.size) and (x.kind.what != "delay" or abs(x.size) > LEAST_DELAY)
     ]
     inputs = [x for x in found if x.kind.of_inputs and x.gain > worth]
@@ -95,12 +93,12 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     Returns
     -------
     list of RecordingError
-        Without those that the log does not determine, and impossible ones.
+        Without impossible ones.
     """
     joint = JointEquations.of(intervals, fit, kinds)
-    step = joint.step(joint.right)
-    each = zip(kinds, step.sizes.tolist(), step.std.tolist(), strict=True)
-    found = [RecordingError(kind, size, std, 0.5 * (size / std) ** 2) for kind, size, std in each if np.isfinite(std)]
+    sizes, std, _ = joint.errors_of(joint.solve())
+    each = zip(kinds, sizes.tolist(), std.tolist(), strict=True)
+    found = [RecordingError(kind, size, std, 0.5 * (size / std) ** 2) for kind, size, std in each]
     return [x for x in found if is_possible(intervals, x.kind, x.size)]
 
 

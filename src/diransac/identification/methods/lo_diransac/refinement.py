@@ -19,15 +19,14 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step, linearized
+from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
+from diransac.identification.methods.lo_diransac.joint_equations import linearized
 from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.normal_equations import (
     Fit,
@@ -58,17 +57,17 @@ _TAU_START = 0.3
 _SIGMA_FLOOR = 1e-5
 # Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
 _LEAST_PRIOR = 1e-6
-# Discrepancies of a model that is taken to be exact, over their prior sizes.
 _EXACT = 1e-3
+"""Unmodelled accelerations of a model that is taken to be exact, over their prior size."""
+_OFF = 1e-8
+"""Input gain and bias discrepancies that are off, over that which equals an equation's inertial force."""
 # Where they start, and the factor by which they are lowered in a step.
 _NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
 _MAX_SWEEPS = 12
+HOPELESS = 0.1
+"""Loss of log-likelihood per sample, of errors a tenth larger, from which on a fit is clearly less likely."""
 # Change of an error of a recording over its standard error that ends a fit.
 _ERRORS_SETTLED = 0.1
-# Nats in every sample by which a fit is lost; steps of which the best says how much it gains in each of so many more.
-_LOST, _RECENT, _MORE = 2.5, 4, 10
-# Updates of the noise at most, and nats in every sample from which on they go on.
-_UPDATES, _SETTLED = 20, 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -256,17 +255,39 @@ def diverges(fit: Fit) -> bool:
     return not _ends_well(fit.ends).all()
 
 
-def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
-    """Fit after steps and updates of every scale until convergence.
+class Schedule(Protocol):
+    """Rule by which the scales of a fit follow its steps.
 
     Parameters
     ----------
-    settings : LoDiransacSettings
+    settled : float
+        Change of a parameter, standard errors, and relative change of the noise that end a fit.
+    """
+
+    settled: float
+
+    def after(self, step: Step) -> Fit:
+        """The fit after a step, with every scale updated."""
+        ...
+
+
+def minimise(
+    intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: int, rival: float = np.inf
+) -> Refinement:
+    """The fit after Gauss-Newton steps, with an update of every scale after each, until convergence.
+
+    Parameters
+    ----------
     intervals : ShootingIntervals
         Their errors of recordings are estimated, too.
     fit : Fit
         Initial fit, as from `start`.
-    prior : Prior
+    schedule : Schedule
+    limit : int
+        Largest number of steps.
+    rival : float, optional
+        Negative log-likelihood of the samples in another fit.  This one ends where the gain of its last step in each
+        that is left would leave its samples clearly less likely.
 
     Returns
     -------
@@ -277,133 +298,121 @@ def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit,
     TimeLimitError
         The time limit was reached.
     """
-    return refine_by(settings, intervals, fit, partial(_update, settings, prior))
-
-
-def refine_by(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, update: Callable[[Step], Fit]
-) -> Refinement:
-    """Fit after steps until convergence, with every scale updated after each; arguments and errors as `refine`."""
     damping, converged, steps, at = 0.0, False, 0, linearized(intervals, fit)
+    loss, hopeless = np.inf, rival + HOPELESS * np.count_nonzero(intervals.known)
     del fit
-    while steps < settings.max_steps and not converged:
+    while steps < limit and not converged:
         check_time()
         steps += 1
-        taken = gauss_newton_step(at, damping)
-        intervals, damping, updated = taken.intervals, taken.damping, update(taken)
-        errors = np.sqrt(np.diag(taken.solved.var_p)[: intervals.n_p])
-        converged = taken.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors)
-        del at, taken  # the next equations take as much memory
+        step = gauss_newton_step(at, damping)
+        intervals, damping, updated = step.intervals, step.damping, schedule.after(step)
+        errors = np.sqrt(np.diag(step.solved.var_p)[: intervals.n_p])
+        converged = step.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors, schedule.settled)
+        if hopeless < np.inf:
+            before, loss = loss, updated.noise.loss(updated.residuals, intervals.known)
+            if loss - (limit - steps) * (before - loss) > hopeless:
+                limit = steps
+        del at, step  # the next equations take as much memory
         at = linearized(intervals, updated)
     return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
 
 
-def refine_exact(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior, rival: float = np.inf
-) -> Refinement:
-    """Fit of the model as it is, without unmodelled accelerations and input gain and bias discrepancies.
+@dataclass(frozen=True, eq=False, repr=False)
+class Flexible:
+    """Schedule by evidence: noise by EM, sizes of unmodelled accelerations and of input gain and bias discrepancies."""
+
+    settings: LoDiransacSettings
+    prior: Prior
+    settled = 0.01
+
+    def after(self, step: Step) -> Fit:
+        """The fit with every scale updated from residuals, unmodelled accelerations and discrepancies."""
+        intervals, fit, solved, prior = step.intervals, step.fit, step.solved, self.prior
+        noise = fit.noise.updated(fit.residuals, intervals.known, outliers=self.settings.outliers)
+        sums = process_sums(intervals, fit, solved).total()
+        tau, rho = sums.most_probable_size(prior.tau, fit.tau), sums.correlation(prior.tau)
+        if not self.settings.model_error:
+            tau = np.maximum(SHRINK * fit.tau, prior.exact)
+        continuity = np.maximum(negligible_jumps(intervals, tau), SHRINK * fit.continuity_std)
+        sizes = _discrepancies(fit, prior, np.diag(solved.var_p)[: len(fit.shared)], intervals.n_p)
+        return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity, prior=sizes)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Exact:
+    """Schedule of the model as it is: unmodelled accelerations and jumps are tightened step by step, down to the least.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    intervals : ShootingIntervals
-    fit : Fit
-        Initial fit, as from `refine`.
-    prior : Prior
-    rival : float, optional
-        Cost of a fit to which this one is an alternative: it ends where it is behind by far more than it still gains.
-
-    Returns
-    -------
-    Refinement
-
-    Raises
-    ------
-    TimeLimitError
-        The time limit was reached.
+    tau : (n_v,) array
+        Least unmodelled accelerations.
+    jumps : (n_x,) array
+        Least jumps.
     """
+
+    settings: LoDiransacSettings
+    tau: FloatArray
+    jumps: FloatArray
+    settled = 0.01
+
+    @classmethod
+    def of(cls, settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Exact:
+        """Schedule from a fit: jumps become negligible beside the uncertainty of its states."""
+        at = linearized(intervals, fit)
+        unbroken = unbroken_jumps(fit, at.solve())
+        least = np.clip(unbroken, negligible_jumps(intervals, prior.exact), fit.continuity_std)
+        return cls(settings, prior.exact, least)
+
+    def after(self, step: Step) -> Fit:
+        """The fit with its noise updated and other scales lowered."""
+        before, fit = step.at.fit, step.fit
+        return replace(
+            fit,
+            noise=fit.noise.updated(fit.residuals, step.intervals.known, outliers=self.settings.outliers),
+            tau=np.maximum(self.tau, _TIGHTENED * before.tau),
+            continuity_std=np.maximum(self.jumps, _TIGHTENED * before.continuity_std),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentsApart:
+    """Schedule of simulation error: windows that nothing ties have no scale but the noise."""
+
+    outliers: bool
+    settled = 0.1
+
+    def after(self, step: Step) -> Fit:
+        """The fit with its noise updated."""
+        fit = step.fit
+        noise = fit.noise.updated(fit.residuals, step.intervals.known, outliers=self.outliers)
+        return replace(fit, noise=noise)
+
+
+def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+    """Fit of the model with discrepancies, whose sizes are those of the largest evidence; errors as `minimise`."""
+    return minimise(intervals, fit, Flexible(settings, prior), settings.max_steps)
+
+
+def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+    """Fit of the model as it is, from one with discrepancies, as from `refine`; errors as `minimise`."""
     shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
-    shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _EXACT * prior.guarded * prior.unit[intervals.n_p :]
+    shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _OFF * prior.unit[intervals.n_p :]
     fit = replace(fit, shared=shared, d=np.zeros_like(fit.d), tau=tau, rho=np.zeros_like(tau), prior=sizes)
     fit = with_residuals(intervals, replace(fit, continuity_std=negligible_jumps(intervals, tau)))
-    return _tightened(settings, intervals, fit, prior.exact, rival)
+    return minimise(intervals, fit, Exact.of(settings, intervals, fit, prior), settings.max_steps)
 
 
 def refine_further(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit) -> Refinement:
-    """Fit of the model as it is from another one, whose scales stay as tight as they are.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    intervals : ShootingIntervals
-    fit : Fit
-        As from `refine_exact`.
-
-    Returns
-    -------
-    Refinement
-
-    Raises
-    ------
-    TimeLimitError
-        The time limit was reached.
-    """
-    return _tightened(settings, intervals, fit, fit.tau, np.inf)
-
-
-def _tightened(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, least: FloatArray, rival: float
-) -> Refinement:
-    """Fit whose unmodelled accelerations and jumps are tightened step by step, down to some least accelerations."""
-    n_p, jumps, begins = intervals.n_p, fit.continuity_std, bool((fit.tau > least).any())
-    damping, converged, steps, at, behind = 0.0, False, 0, linearized(intervals, fit), list[float]()
-    del fit
-    while steps < settings.max_steps and not converged and not _is_lost(intervals, behind):
-        check_time()
-        steps += 1
-        taken = gauss_newton_step(at, damping)
-        intervals, moved, damping = taken.intervals, taken.fit, taken.damping
-        if rival < np.inf:
-            behind.append(_least_loss(intervals, moved, outliers=settings.outliers) - rival)
-        noise = moved.noise.updated(moved.residuals, intervals.known, outliers=settings.outliers)
-        tau = np.maximum(least, _TIGHTENED * at.fit.tau)
-        if begins and steps == 1:
-            jumps = np.clip(unbroken_jumps(at.fit, taken.solved), negligible_jumps(intervals, least), jumps)
-        continuity = np.maximum(jumps, _TIGHTENED * at.fit.continuity_std)
-        updated = replace(moved, noise=noise, tau=tau, continuity_std=continuity)
-        settled = bool((tau == at.fit.tau).all()) and taken.of_errors < _ERRORS_SETTLED
-        converged = settled and _unchanged(at.fit, updated, np.sqrt(np.diag(taken.solved.var_p)[:n_p]))
-        del at, taken, moved
-        at = linearized(intervals, updated)
-    return Refinement(at.intervals, at.fit, _evidence(at), steps, converged)
-
-
-def _is_lost(intervals: ShootingIntervals, behind: Sequence[float]) -> bool:
-    """True if a fit that was so far behind its rival after each step stays behind."""
-    if len(behind) <= _RECENT:
-        return False
-    best = max(-np.diff(behind[-_RECENT:]).min(), 0.0)
-    return bool(behind[-1] - _MORE * best > _LOST * intervals.known.sum())
-
-
-def _least_loss(intervals: ShootingIntervals, fit: Fit, *, outliers: bool) -> float:
-    """Negative log-likelihood of the samples with the likeliest noise: that of a fit lags behind its residuals."""
-    noise, residuals, known, loss = fit.noise, fit.residuals, intervals.known, np.inf
-    for _ in range(_UPDATES):
-        before, loss = loss, noise.loss(residuals, known)
-        if before - loss < _SETTLED * known.sum():
-            break
-        noise = noise.updated(residuals, known, outliers=outliers)
-    return loss
+    """Fit of the model as it is, from one as of `refine_exact`, whose scales stay as tight; errors as `minimise`."""
+    return minimise(intervals, fit, Exact(settings, fit.tau, fit.continuity_std), settings.max_steps)
 
 
 def _evidence(at: JointEquations) -> float:
     """Negative log evidence of a fit at its optimum; infinite where a rollout diverges."""
     if diverges(at.fit):
         return np.inf
-    return negative_log_evidence(
-        at.intervals, at.fit, at.of_fit.system.solve(at.of_fit.right_z, at.of_fit.right_s).log_det
-    )
+    return negative_log_evidence(at.intervals, at.fit, at.log_det)
 
 
 def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float) -> float:
@@ -436,37 +445,27 @@ def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float
     return float(loss + 0.5 * beforehand + 0.5 * log_det + scales)
 
 
-def _update(settings: LoDiransacSettings, prior: Prior, taken: Step) -> Fit:
-    """The fit after a step with every scale updated from residuals, unmodelled accelerations and discrepancies."""
-    intervals, fit, solved = taken.intervals, taken.fit, taken.solved
-    noise = fit.noise.updated(fit.residuals, intervals.known, outliers=settings.outliers)
-    sums = process_sums(intervals, fit, solved).total()
-    tau, rho = sums.most_probable_size(prior.tau, fit.tau), sums.correlation(prior.tau)
-    if not settings.model_error:
-        tau = np.maximum(SHRINK * fit.tau, 1e-3 * prior.tau)
-    continuity = np.maximum(negligible_jumps(intervals, tau), SHRINK * fit.continuity_std)
-    sizes = _discrepancies(fit, prior, np.diag(solved.var_p), intervals.n_p) if intervals.discrepancies else fit.prior
-    return replace(fit, noise=noise, tau=tau, rho=rho, continuity_std=continuity, prior=sizes)
-
-
 def _discrepancies(fit: Fit, prior: Prior, variance: FloatArray, n_p: int) -> FloatArray:
     """Prior sizes with those of the input gain and bias discrepancies, which have one in common."""
     sizes, unit, now = fit.prior.copy(), prior.unit[n_p:], fit.prior[n_p:]
+    if not len(now):
+        return sizes
     squares = np.square(fit.shared[n_p:] / unit).sum()
     determined = (1.0 - variance[n_p:] / np.square(now)).clip(0.0).sum()
     sizes[n_p:] = unit * most_probable_size(squares, determined, prior.discrepancy, now[0] / unit[0])
     return sizes
 
 
-def _unchanged(old: Fit, new: Fit, errors: FloatArray) -> bool:
-    """True if parameters move by less than a hundredth of their standard errors, and scales by a few hundredths."""
+def _unchanged(old: Fit, new: Fit, errors: FloatArray, settled: float) -> bool:
+    """True if no parameter moves by a part of its standard error, nor the noise by as much, and other scales hardly."""
     n_p = len(errors)
     moved = np.abs(new.shared - old.shared)[:n_p] / (errors + 1e-9 * np.abs(old.shared[:n_p]) + 1e-300)
     changes = (
-        (np.abs(np.log(new.noise.sigma / old.noise.sigma)), 0.01),
+        (moved, settled),
+        (np.abs(np.log(new.noise.sigma / old.noise.sigma)), settled),
         (np.abs(np.log(new.tau / old.tau)), 0.05),
         (np.abs(new.rho - old.rho), 0.02),
         (np.abs(np.log(new.continuity_std / old.continuity_std)), 0.05),
         (np.abs(np.log(new.prior[n_p:] / old.prior[n_p:])), 0.1),
     )
-    return bool((moved < 0.01).all() and all((change < limit).all() for change, limit in changes))
+    return all(bool((change < limit).all()) for change, limit in changes)

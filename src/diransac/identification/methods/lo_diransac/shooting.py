@@ -69,6 +69,9 @@ class ShootingIntervals:
         Whether the model is augmented by input gain and bias discrepancies.
     noisy : bool, optional
         Whether the unknowns of an interval are errors of the inputs instead of unmodelled accelerations.
+    apart : bool, optional
+        Whether intervals are tied by nothing but the parameters: neither by continuity nor by unmodelled accelerations,
+        of which there are none (simulation error).
     """
 
     model: Model
@@ -87,6 +90,7 @@ class ShootingIntervals:
     threads: int = 1
     discrepancies: bool = True
     noisy: bool = False
+    apart: bool = False
 
     @classmethod
     def of(
@@ -142,7 +146,7 @@ class ShootingIntervals:
     def linked(self) -> BoolArray:
         """Mask ``(W - 1,)`` of the intervals that continue in the next one, of the same log and without a gap."""
         reached = self._reached.reshape(len(self), self.length)[:-1, -1] & ~self.gaps[self.starts[1:]]
-        return np.asarray((self.log_of[1:] == self.log_of[:-1]) & reached)
+        return np.asarray((self.log_of[1:] == self.log_of[:-1]) & reached & (not self.apart))
 
     @cached_property
     def following(self) -> BoolArray:
@@ -194,6 +198,8 @@ class ShootingIntervals:
     @cached_property
     def augmented(self) -> AugmentedModel:
         """The model with its discrepancies."""
+        if self.apart:
+            return AugmentedModel(self.model, self.model.n_p, 0, 0)
         return augmented_model(self.model, discrepancies=self.discrepancies, noisy=self.noisy)
 
     @property
@@ -214,6 +220,8 @@ class ShootingIntervals:
     @cached_property
     def inputs(self) -> FloatArray:
         """Inputs ``(N, n_u)`` as they act, after their delays and lags."""
+        if self.apart:
+            return self.recorded
         errors = self.all_errors
         timing = errors.input_delay, errors.input_lag, errors.gain_drift
         n_rows = [int(self.is_logged[rows].sum()) for rows in self.rows_of_logs]
@@ -304,6 +312,27 @@ class ShootingIntervals:
         errors = self.all_errors
         return replace(self, errors=replace(errors, sizes={x: size for x, size in errors.sizes.items() if x != kind}))
 
+    def parts_apart(self, acting: FloatArray, hold: str, starts: IntArray, length: int) -> ShootingIntervals:
+        """Parts of the logs as intervals that nothing ties.
+
+        Parameters
+        ----------
+        acting : (N, n_u) array
+            Inputs as they act.
+        hold : str
+            Of these, one of `HOLDS`.
+        starts : (K,) int array
+            First row of each part.
+        length : int
+            Its rows.
+        """
+        rows = (starts[:, None] + np.arange(length)).ravel()
+        return replace(
+            self, measured=self.measured[rows], sampled=self.sampled[rows], recorded=acting[rows], errors=None,
+            is_logged=np.ones(len(rows), bool), gaps=np.zeros(len(rows), bool), log_of=self.log_of_row[starts],
+            length=length, hold=hold, apart=True, discrepancies=False, noisy=False,
+        )  # fmt: skip
+
     def split(self, parts: int) -> ShootingIntervals:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
@@ -342,19 +371,12 @@ class ShootingIntervals:
         logs, starts, rows = self.log_of, self.starts, self._rows_about(chosen)
         if chosen is not None:
             logs, starts, x, d = logs[chosen], starts[chosen], x[chosen], d[chosen]
-        parameters = np.empty((len(x), self.model.n_p + len(shared) - self.n_p + d.shape[1]))
-        parameters[:, : self.model.n_p] = self.parameters_of(shared[: self.n_p], logs)
-        parameters[:, self.model.n_p : -d.shape[1]] = shared[self.n_p :]
-        parameters[:, -d.shape[1] :] = d
-        return RolloutBatch(
-            parameters,
-            x,
-            self.inputs[rows],
-            self.dt,
-            starts - rows.start,
-            self.length,
-            self.first_of_log - rows.start,
-        )
+        n_p, last = self.model.n_p, self.model.n_p + len(shared) - self.n_p
+        parameters = np.empty((len(x), last + d.shape[1]))
+        parameters[:, :n_p] = self.parameters_of(shared[: self.n_p], logs)
+        parameters[:, n_p:last], parameters[:, last:] = shared[self.n_p :], d
+        first = (starts if self.apart else self.first_of_log) - rows.start
+        return RolloutBatch(parameters, x, self.inputs[rows], self.dt, starts - rows.start, self.length, first)
 
     def _rows_about(self, chosen: IntArray | None) -> slice:
         """Rows from the first to the last of chosen intervals, and the two about them on which inputs depend."""
@@ -381,15 +403,20 @@ class ShootingIntervals:
         Returns
         -------
         (n * length, n_s) array
-            Simulated less measured signals, huge from a divergence on.
+            Simulated less measured signals, huge from a divergence on; 0 of signals that nothing measures.
         (n, n_x) array
             States one row after the last of each interval, NaN where it diverges.
         """
-        rows = self._rows_about(chosen)
-        errors, ends = self.rollouts.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements(rows))
+        (derived, columns), rows = self._derived, self._rows_about(chosen)
+        errors, ends = derived.errors_and_ends(self.batch(shared, x, d, chosen), self.measurements(rows, columns))
         if not np.isfinite(errors).all():
             np.nan_to_num(errors, copy=False, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED)
-        return errors.reshape(-1, errors.shape[2]), ends
+        errors = errors.reshape(-1, errors.shape[2])
+        if isinstance(columns, slice):
+            return errors, ends
+        residuals = np.zeros((len(errors), self.measured.shape[1]))
+        residuals[:, columns] = errors
+        return residuals, ends
 
     def gauss_newton(
         self,

@@ -21,9 +21,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
+from diransac.arrays import FloatArray
 from diransac.identification.estimate import LogEstimate
-from diransac.identification.methods.lo_diransac.mixture import Mixture, NoiseSums, lower_scale
+from diransac.identification.methods.lo_diransac.joint_equations import bounded
+from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
+from diransac.identification.methods.lo_diransac.normal_equations import (
+    Fit,
+    linearize,
+    weights_of,
+    with_residuals,
+    without_windows,
+)
+from diransac.identification.methods.lo_diransac.refinement import HOPELESS, SegmentsApart, minimise
 from diransac.identification.methods.lo_diransac.segments import (
     ActingInputs,
     Segments,
@@ -33,9 +42,9 @@ from diransac.identification.methods.lo_diransac.segments import (
     whole_stretches,
 )
 from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate, jackknife
-from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
+    from diransac.arrays import IntArray
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -49,14 +58,12 @@ _ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
 """Rows of the fits from several starts, and of others, at most."""
 _WHOLE_ROW = 1.0 / 12.0
 """Variance of a number that is rounded to a whole one."""
-_STEPS, _FEW_STEPS, _CONVERGED, _NOISE_MOVES = 25, 3, 0.1, 0.03
-"""Steps at most, and of a solution that is close to another; change of parameters, standard errors, and relative change
-of the noise that end them."""
+_STEPS = 25
+"""Largest number of steps."""
+_FEW_STEPS = 3
+"""Steps of a solution that is close to another."""
 _SIMULATED = 0.5
 """Robust scale of the errors over the spread of a signal, up to which a simulation follows it."""
-_HOPELESS = 0.1
-"""Loss of log-likelihood per sample, of errors a tenth larger, from which on a solution is not followed to its end."""
-_DAMPING, _DAMPING_BOUNDS = 1e-6, (1e-12, 1e6)
 _RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
 
 
@@ -105,8 +112,9 @@ def simulation_error_candidates(
             break
         chain.append(longer.descended())
     last, taken = chain[-1], chain[-1].segments.acting
-    others = [last.with_inputs(x).descended(rival=last.cost) for x in actings if x is not taken]
-    found = [*(x for x in others if x.cost < x.hopeless(last.cost)), *chain[1:]]
+    others = [last.with_inputs(x).descended(rival=last.loss) for x in actings if x is not taken]
+    hopeless = last.cost + HOPELESS * np.count_nonzero(last.windows.known)
+    found = [*(x for x in others if x.cost < hopeless), *chain[1:]]
     return [(x.candidate(blocks), x.simulated) for x in reversed(found)]
 
 
@@ -201,13 +209,12 @@ def _from_starts(
 
 def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> Mixture:
     """Noise before anything is known: a tenth of the spread of each signal."""
-    intervals, columns = segments.intervals, segments.columns
-    low = np.where(intervals.sampled, intervals.measured, np.inf).min(axis=0)[columns]
-    high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)[columns]
-    span = np.where(high > low, high - low, 1.0)
-    sizes, place = spread[columns], {int(c): k for k, c in enumerate(columns)}
-    whole = [(place[a], place[b], place[c], place[d]) for a, b, c, d in intervals.model.quaternions if a in place]
-    return Mixture(0.1 * sizes, np.full(len(columns), 0.1 * outliers), span, _FLOOR * sizes, whole)
+    intervals = segments.intervals
+    low = np.where(intervals.sampled, intervals.measured, np.inf).min(axis=0)
+    high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)
+    span, columns = np.where(high > low, high - low, 1.0), set(segments.columns.tolist())
+    whole = [four for four in intervals.model.quaternions if columns.issuperset(four)]
+    return Mixture(0.1 * spread, np.full(len(spread), 0.1 * outliers), span, _FLOOR * spread, whole)
 
 
 def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixture) -> FloatArray:
@@ -217,7 +224,7 @@ def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixtu
     errors = few.errors(lanes, _first_states(few, motion, lanes, noise)[0])
     known = few.known.reshape(-1, errors.shape[3])
     scale = lower_scale(errors.reshape(len(starts), *known.shape), known)
-    return np.asarray(np.log(np.nan_to_num(scale) + noise.floor).sum(axis=1))
+    return np.asarray(np.log(np.nan_to_num(scale) + noise.floor[few.columns]).sum(axis=1))
 
 
 def _first_states(
@@ -231,183 +238,126 @@ def _first_states(
     mean, spread = prior_states(segments.intervals, motion, inlying, segments.starts)
     states = np.repeat(mean[None], len(lanes), axis=0)
     counted = segments.known & inlying[segments.rows][:, :, segments.columns]
-    weights = segments.weights(counted / np.square(noise.sigma))
+    weights = segments.weights(counted / np.square(noise.sigma[segments.columns]))
     return segments.estimated_states(lanes, states, spread, weights), mean, spread
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class _Solution:
-    """Parameters with the initial states of all segments.
+    """Parameters with the initial states of all segments: a fit of windows that nothing ties.
 
     Parameters
     ----------
     segments : Segments
     motion : Motion
         Smoothed.
-    parameters : (n,) array
-    noise : Mixture
-        Of the compared signals.
-    states, mean, spread : (K, n_x), (K, n_x) and (n_x,) array
-        Initial states, and means and standard deviations of their prior.
-    errors : (K n_rows, n_s) array
-        Simulated less measured samples.
+    windows : ShootingIntervals
+        The segments.
+    fit : Fit
     """
 
     segments: Segments
     motion: Motion
-    parameters: FloatArray
-    noise: Mixture
-    states: FloatArray
-    mean: FloatArray
-    spread: FloatArray
-    errors: FloatArray
+    windows: ShootingIntervals
+    fit: Fit
 
     @classmethod
     def begin(cls, segments: Segments, motion: Motion, parameters: FloatArray, noise: Mixture) -> _Solution:
         """The solution with states that agree best with the samples of their segments."""
-        lanes = np.repeat(parameters[None, None], len(segments), axis=1)
-        states, mean, spread = _first_states(segments, motion, lanes, noise)
-        errors = _errors(segments, parameters, states[0])
-        return cls(segments, motion, parameters, noise, states[0], mean, spread, errors)
+        lanes, layout = np.repeat(parameters[None, None], len(segments), axis=1), segments.intervals.layout
+        states, mean, std = _first_states(segments, motion, lanes, noise)
+        windows, nothing, x = _windows(segments), np.zeros(0), states[0]
+        fit = Fit(
+            parameters, x, np.zeros((len(x), 0)), nothing, nothing, noise, nothing, nothing, np.ones(x.shape[1]),
+            layout.prior_std, layout.prior_mean, x_mean=mean, x_std=std,
+        )  # fmt: skip
+        return cls(segments, motion, windows, with_residuals(windows, fit))
 
-    def _at(self, segments: Segments, parameters: FloatArray, states: FloatArray) -> _Solution:
-        """The solution with other segments, parameters and states."""
-        errors = _errors(segments, parameters, states)
-        return replace(self, segments=segments, parameters=parameters, states=states, errors=errors)
+    @property
+    def parameters(self) -> FloatArray:
+        """Parameters ``(n,)``."""
+        return self.fit.shared
 
     @cached_property
-    def _known(self) -> BoolArray:
-        return self.segments.known.reshape(self.errors.shape)
+    def _losses(self) -> FloatArray:
+        """Negative log-likelihood ``(K,)`` of the samples of each segment."""
+        losses = self.fit.noise.negative_log_likelihood(self.fit.residuals, self.windows.known)
+        return np.asarray(losses.reshape(len(self.windows), -1).sum(axis=1))
 
-    @cached_property
-    def _losses_and_inlying(self) -> tuple[FloatArray, FloatArray]:
-        """Loss of each sample, and the probability that it is no outlier."""
-        return self.noise.losses_and_inlying(self.errors, self._known)
+    @property
+    def loss(self) -> float:
+        """Negative log-likelihood of all samples."""
+        return float(self._losses.sum())
 
     @cached_property
     def cost(self) -> float:
         """Negative logarithm of the probability of samples and states."""
-        of_states = 0.5 * np.square((self.states - self.mean) / self.spread).sum()
-        return float(self._losses_and_inlying[0].sum() + of_states)
-
-    @cached_property
-    def _equations(self) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton matrix and gradient of each segment's state and of all parameters; zero after a divergence."""
-        return self._equations_of(np.ones(len(self.segments.intervals.measured), bool))
-
-    def _equations_of(self, rows: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """The same with samples in some rows (N,) alone."""
-        segments, n_x = self.segments, self.states.shape[1]
-        weights = segments.weights(self._losses_and_inlying[1] / np.square(self.noise.sigma)) * rows[:, None]
-        sums = segments.gauss_newton(*_lanes(segments, self.parameters, self.states), weights)
-        H, g = sums.normal_matrix, sums.gradient
-        if not segments.intervals.layout.is_shared:
-            H, g = self._spread_out(H, g)
-        H[:, :n_x, :n_x] += np.diag(self.spread**-2.0)
-        g[:, :n_x] += (self.states - self.mean) / np.square(self.spread)
-        return H, g
-
-    def _spread_out(self, H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Matrix and gradient of states and all parameters, from those of the parameters of each segment's log."""
-        segments, (K, n_x) = self.segments, self.states.shape
-        own = segments.intervals.layout.index[segments.intervals.log_of_row[segments.starts]]
-        at, n = np.hstack([np.tile(np.arange(n_x), (K, 1)), n_x + own]), n_x + len(self.parameters)
-        matrix, gradient, k = np.zeros((K, n, n)), np.zeros((K, n)), np.arange(K)
-        matrix[k[:, None, None], at[:, :, None], at[:, None, :]], gradient[k[:, None], at] = H, g
-        return matrix, gradient
-
-    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Equations of the parameters without the states, as `_eliminated`."""
-        return _eliminated(*self._equations, self.states.shape[1], damping)
-
-    def hopeless(self, rival: float) -> float:
-        """Cost from which on the samples are clearly less likely than a rival leaves them."""
-        return rival + _HOPELESS * np.count_nonzero(self._known)
+        away = (self.fit.x - self.fit.x_mean) / self.fit.x_std
+        return self.loss + 0.5 * float(np.square(away).sum())
 
     def likelier(self, other: _Solution) -> _Solution:
-        """The likelier of this solution and another one, which descends as long as it may become so."""
-        found = other.descended(rival=self.cost)
+        """The likelier of this solution and another one, after its descent."""
+        found = other.descended(rival=self.loss)
         return found if found.cost < self.cost else self
 
-    def descended(self, steps: int = _STEPS, rival: float = np.inf) -> _Solution:
-        """The solution after some steps of Levenberg and Marquardt, each with an update of the noise (EM).
-
-        They end where as much gain in all others would leave the samples clearly less likely than a rival does.
-        """
-        now, damping, hopeless = self, _DAMPING, self.hopeless(rival)
-        for left in reversed(range(steps)):
-            check_time()
-            cost = now.cost
-            sums = NoiseSums.of(now.errors, now._known, now._losses_and_inlying[1])
-            noise = now.noise.of_sums(sums, outliers=bool(now.noise.pi.any()))
-            is_steady = bool((np.abs(np.log(noise.sigma / now.noise.sigma)) < _NOISE_MOVES).all())
-            now = replace(now, noise=noise)
-            then, change, damping = now._stepped(damping)
-            if then is None:
-                break
-            now = then
-            if (change < _CONVERGED and is_steady) or now.cost - left * (cost - now.cost) > hopeless:
-                break
-        return now
-
-    def _stepped(self, damping: float) -> tuple[_Solution | None, float, float]:
-        """The solution after a step that lowers the cost, or None; its change, standard errors; the next damping."""
-        intervals, least = self.segments.intervals, max(0.1 * damping, _DAMPING_BOUNDS[0])
-        while damping <= _DAMPING_BOUNDS[1]:
-            parts, following = self._reduced(damping)
-            matrix, gradient = _with_priors(intervals, self.parameters, parts)
-            p = _moved(intervals, self.parameters, -_solved(matrix, gradient, damping))
-            change = p - self.parameters
-            then = self._at(self.segments, p, self.states - following @ np.append(change, 1.0))
-            if then.cost < self.cost:
-                sizes = np.abs(change) * np.sqrt(np.maximum(np.diag(matrix), 0.0))
-                return then, float(sizes.max()), least
-            damping = least = 10.0 * damping
-        return None, 0.0, damping
+    def descended(self, limit: int = _STEPS, rival: float = np.inf) -> _Solution:
+        """The solution after some steps, each with an update of the noise (EM); a rival as of `minimise`."""
+        schedule = SegmentsApart(outliers=bool(self.fit.noise.pi.any()))
+        return replace(self, fit=minimise(self.windows, self.fit, schedule, limit, rival).fit)
 
     def grown(self, length: int) -> _Solution:
         """The solution over all segments of a length, of which states and noise are their own."""
         longer = _segments(self.segments.intervals, self.segments.acting, length, _MOST_ROWS)
-        found = _Solution.begin(longer, self.motion, self.parameters, self.noise)
-        scale = np.nan_to_num(lower_scale(found.errors, found._known), nan=1.0)
-        return replace(found, noise=replace(self.noise, sigma=np.maximum(scale, self.noise.floor)))
+        found, noise = _Solution.begin(longer, self.motion, self.parameters, self.fit.noise), self.fit.noise
+        scale = np.nan_to_num(lower_scale(found.fit.residuals, found.windows.known), nan=1.0)
+        noise = replace(noise, sigma=np.maximum(scale, noise.floor))
+        return replace(found, fit=replace(found.fit, noise=noise))
 
     @property
     def is_simulated(self) -> bool:
         """True if the errors are clearly less than the spread of their signals: the simulation is not lost."""
-        spread = self.motion.spread[self.segments.columns]
-        return bool((self.noise.sigma < _SIMULATED * spread).all())
+        columns = self.segments.columns
+        return bool((self.fit.noise.sigma < _SIMULATED * self.motion.spread)[columns].all())
 
     def with_inputs(self, acting: ActingInputs) -> _Solution:
         """The solution with inputs that act otherwise, at the same parameters and states."""
-        return self._at(replace(self.segments, acting=acting), self.parameters, self.states)
+        segments = replace(self.segments, acting=acting)
+        windows = _windows(segments)
+        return replace(self, segments=segments, windows=windows, fit=with_residuals(windows, self.fit))
 
     def candidate(self, blocks: Blocks) -> Candidate:
         """The estimate, and what it is without each block by one Newton step."""
-        segments, intervals, without = self.segments, self.segments.intervals, []
-        for parts in self._parts_without(blocks):
-            step = -_solved(*_with_priors(intervals, self.parameters, parts), 0.0)
-            without.append(_moved(intervals, self.parameters, step))
+        segments, intervals = self.segments, self.segments.intervals
+        without = np.array([bounded(intervals, self.parameters, self.parameters + x) for x in self._steps(blocks)])
         name = f"simulation error, {segments.n_rows * intervals.dt:.2g} s, {segments.acting.sentence}"
-        return Candidate(name, self.parameters, np.array(without), segments.acting, intervals)
+        return Candidate(name, self.parameters, without, segments.acting, intervals)
 
-    def _parts_without(self, blocks: Blocks) -> Iterator[FloatArray]:
-        """Equations ``(K, n, n + 1)`` without each block: without its segments, or without its rows of longer ones."""
-        of_row, segments = blocks.of_row, self.segments
-        longer = segments.n_rows > np.bincount(of_row, minlength=blocks.n).min()
-        block, parts = of_row[segments.starts + segments.n_rows // 2], None if longer else self._reduced(0.0)[0]
+    def _steps(self, blocks: Blocks) -> Iterator[FloatArray]:
+        """Newton steps ``(n,)`` of the parameters without each block: its segments, or its rows of longer ones."""
+        of_row, segments, windows, weights = blocks.of_row, self.segments, self.windows, self._weights
+        if segments.n_rows > np.bincount(of_row, minlength=blocks.n).min():
+            own = of_row[segments.rows.ravel()]
+            for k in range(blocks.n):
+                at = linearize(windows, self.fit, np.where((own != k)[:, None], weights, 0.0))
+                yield at.system.solve(at.right_z, at.right_s).step_p
+            return
+        parts, prior = without_windows(windows, self.fit, linearize(windows, self.fit, weights))
         for k in range(blocks.n):
-            yield parts[block != k] if parts is not None else self._parts_of(of_row != k)
+            left = parts[self._block(blocks) != k].sum(axis=0) + prior
+            yield _solved(left[:, :-1], left[:, -1])
 
-    def _parts_of(self, rows: BoolArray) -> FloatArray:
-        """Equations of the parameters from samples in some rows (N,) alone."""
-        return _eliminated(*self._equations_of(rows), self.states.shape[1], 0.0)[0]
+    @property
+    def _weights(self) -> FloatArray:
+        return weights_of(self.windows, self.fit)
+
+    def _block(self, blocks: Blocks) -> IntArray:
+        """Block ``(K,)`` of the middle of each segment."""
+        return blocks.of_row[self.segments.starts + self.segments.n_rows // 2]
 
     def standard_errors(self, blocks: Blocks) -> FloatArray:
         """Standard errors ``(n,)`` of the parameters, by the jackknife over blocks; those by white noise at least."""
-        matrix, _ = _with_priors(self.segments.intervals, self.parameters, self._reduced(0.0)[0])
-        d = np.sqrt(np.maximum(np.diag(matrix), 0.0)) + _TINY
-        white = np.diag(np.linalg.inv(matrix / np.outer(d, d) + _RIDGE * np.eye(len(d)))) / np.square(d)
+        at = linearize(self.windows, self.fit, self._weights)
+        white = np.diag(at.system.solve(at.right_z, at.right_s).var_p)
         return np.asarray(np.sqrt(np.maximum(np.diag(jackknife(self.candidate(blocks).without)), white)))
 
     def with_own_timing(self, blocks: Blocks) -> tuple[_Solution, int, float]:
@@ -431,61 +381,26 @@ class _Solution:
 
     def costs_without(self, blocks: Blocks) -> FloatArray:
         """Negative log-likelihood of the samples without each block."""
-        each = self._losses_and_inlying[0].reshape(len(self.segments), -1).sum(axis=1)
-        block = blocks.of_row[self.segments.starts + self.segments.n_rows // 2]
-        return np.array([each[block != k].sum() for k in range(blocks.n)])
+        block = self._block(blocks)
+        return np.array([self._losses[block != k].sum() for k in range(blocks.n)])
 
     @property
     def simulated(self) -> Motion:
         """The motion of the segments; the smoothed one in rows that none covers."""
-        lanes, signals = _lanes(self.segments, self.parameters, self.states), self.motion.signals.copy()
-        series = self.segments.trajectories(*lanes)[0]
+        fit, windows, signals = self.fit, self.windows, self.motion.signals.copy()
+        series = windows.rollouts.trajectories(windows.batch(fit.shared, fit.x, fit.d))
         finite = np.isfinite(series).all(axis=(1, 2))
         signals[self.segments.rows[finite]] = series[finite]
         return replace(self.motion, signals=signals)
 
 
-def _eliminated(H: FloatArray, g: FloatArray, n_x: int, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Equations ``(K, n, n + 1)`` of the parameters, the gradient last, without the states.
-
-    After a step dp of the parameters, these change by ``-following (dp, 1)``, with ``following (K, n_x, n + 1)``.
-    """
-    d = np.sqrt(np.einsum("kii->ki", H[:, :n_x, :n_x])) + _TINY
-    scaled = H[:, :n_x, :n_x] / d[:, :, None] / d[:, None, :] + (damping + _RIDGE) * np.eye(n_x)
-    right = np.concatenate([H[:, :, n_x:], g[:, :, None]], axis=2)
-    following = np.linalg.solve(scaled, right[:, :n_x] / d[:, :, None]) / d[:, :, None]
-    return right[:, n_x:] - H[:, n_x:, :n_x] @ following, following
+def _windows(segments: Segments) -> ShootingIntervals:
+    """The segments as windows that nothing ties."""
+    acting = segments.acting
+    return segments.intervals.parts_apart(acting.values, acting.hold, segments.starts, segments.n_rows)
 
 
-def _lanes(segments: Segments, parameters: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parameters and states of the lanes of one batch, from those that all segments share, and ``(K, n_x)``."""
-    return np.repeat(parameters[None, None], len(segments), axis=1), states[None]
-
-
-def _errors(segments: Segments, parameters: FloatArray, states: FloatArray) -> FloatArray:
-    """Simulated less measured samples ``(K n_rows, n_s)``; arguments as of `_lanes`."""
-    errors = segments.errors(*_lanes(segments, parameters, states))[0]
-    return np.asarray(errors.reshape(-1, len(segments.columns)))
-
-
-def _with_priors(intervals: ShootingIntervals, p: FloatArray, parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Matrix and gradient of the parameters, of segments' parts ``(K, n, n + 1)`` and of priors."""
-    precision, total = 1.0 / np.square(intervals.layout.prior_std), parts.sum(axis=0)
-    away = np.where(precision > 0.0, p - intervals.layout.prior_mean, 0.0)
-    return total[:, :-1] + np.diag(precision), total[:, -1] + precision * away
-
-
-def _solved(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
-    """Solution of damped normal equations in columns of unit size; least squares where they are singular."""
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of normal equations in columns of unit size; least squares where they are singular."""
     d = np.sqrt(np.maximum(np.diag(matrix), 0.0)) + _TINY
-    scaled = matrix / d[:, None] / d[None, :] + (damping + _RIDGE) * np.eye(len(matrix))
-    return np.asarray(np.linalg.lstsq(scaled, gradient / d, rcond=None)[0] / d)
-
-
-def _moved(intervals: ShootingIntervals, now: FloatArray, step: FloatArray) -> FloatArray:
-    """Parameters after a step within the bounds; a positive one changes by a factor of two at most."""
-    bounds = intervals.layout.bounds
-    positive = np.array([x.positive for x in bounds])
-    lower, upper = np.array([[x.lower, x.upper] for x in bounds]).T
-    then = np.clip(now + step, lower, upper)
-    return np.where(positive, np.clip(then, 0.5 * now, 2.0 * now), then)
+    return np.asarray(np.linalg.lstsq(matrix / np.outer(d, d), right / d, rcond=_RIDGE)[0] / d)
