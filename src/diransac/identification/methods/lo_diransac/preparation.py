@@ -115,8 +115,8 @@ def stuck_rows(measured: FloatArray) -> BoolArray:
     return repeated
 
 
+# Expected number of runs of equal rows in a log up to which one is no chance.
 _CHANCE = 0.01
-"""Expected number of runs of equal rows in a log up to which one is no chance."""
 
 
 def _resolutions(measured: FloatArray) -> FloatArray:

@@ -32,24 +32,24 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from diransac.model import Model
 
+# Of the polynomials.
 _DEGREE = 4
-"""Of the polynomials."""
+# Samples of a signal to either side of a knot, usually at most.
 _MOST = 25
-"""Samples of a signal to either side of a knot, usually at most."""
+# Factor between half widths that are compared, and by which a window widens that has too few samples.
 _WIDER = 3
-"""Factor between half widths that are compared, and by which a window widens that has too few samples."""
+# Reweightings.
 _PASSES = 12
-"""Reweightings."""
+# Least factor of a scale from one reweighting to the next.
 _SHRINK = 0.3
-"""Least factor of a scale from one reweighting to the next."""
+# Least scale of residuals over the spread of a signal: polynomials are not exact.
 _FLOOR = 1e-4
-"""Least scale of residuals over the spread of a signal: polynomials are not exact."""
+# Least error of a coordinate over its spread that narrow windows, whose derivatives are noisier, are worth.
 _VISIBLE = 0.01
-"""Least error of a coordinate over its spread that narrow windows, whose derivatives are noisier, are worth."""
+# Windows in which half widths are compared, of the usual one.
 _TRIALS = 24
-"""Windows in which half widths are compared, of the usual one."""
+# Residuals that a scale is taken from; more would only cost time.
 _ENOUGH = 4000
-"""Residuals that a scale is taken from; more would only cost time."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,8 +226,8 @@ def _alike(chains: Sequence[Sequence[int]], halves: IntArray, n_rows: int = 0) -
         yield from np.split(columns, range(1, len(columns))) if n_rows > _LONG else [columns]
 
 
+# Rows of a log from which on chains are smoothed one by one, which saves memory.
 _LONG = 10_000
-"""Rows of a log from which on chains are smoothed one by one, which saves memory."""
 
 
 def _smoothed(
