@@ -77,13 +77,13 @@ def _with_outliers_of_the_fit(forward: Forward, candidates: Sequence[Candidate])
 
 
 def _parts() -> dict[str, Part]:
-    off = {"input_delay": False, "input_lag": False, "max_recording_errors": 0}
+    off = {"input_delay": False, "input_lag": False, "sensor_delays": (), "sensor_biases": (), "gain_drifts": ()}
     return {
         "nothing": Part(),
         "random samples": Part(replace(DEFAULT, n_samples=0, n_nonlinear_samples=1)),
         "outlier component of the noise": Part(replace(DEFAULT, outliers=False)),
         "unmodelled accelerations": Part(replace(DEFAULT, model_error=False)),
-        "input gain and bias discrepancy": Part(replace(DEFAULT, prior_discrepancy=1e-6, initial_discrepancy=1e-6)),
+        "input gain and bias discrepancy": Part(replace(DEFAULT, prior_discrepancy=1e-6)),
         "finer intervals": Part(patches=(("local_search.fewest_parts", lambda _: 0),)),
         "errors of recordings": Part(replace(DEFAULT, **off)),
         "errors must explain forces": Part(

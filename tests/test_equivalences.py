@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 
 import diransac as dr
 from diransac.data.dataset import Dataset
+from diransac.identification.core.fit import Fit, with_residuals
+from diransac.identification.core.minimise import SegmentsApart, minimise
+from diransac.identification.core.noise import Mixture
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
-from diransac.identification.methods.lo_diransac.mixture import Mixture
-from diransac.identification.methods.lo_diransac.normal_equations import Fit, with_residuals
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.refinement import SegmentsApart, minimise
 
 TRUTH = {"stiffness": 9.0, "damping": 0.6}
 DT = 0.02
@@ -86,12 +86,19 @@ def assert_same(one: dr.Result, other: dr.Result, errors: float) -> None:
 
 
 @pytest.mark.parametrize("wind", [0.0, 0.1])
-@pytest.mark.parametrize("change", [{"sign": -1.0}, {"unit": 1e-3}, {"time": 0.25}], ids=["sign", "unit", "time"])
-def test_sign_and_unit_of_a_coordinate_and_of_time_change_no_estimate(change: dict[str, float], wind: float) -> None:
+@pytest.mark.parametrize("change", [{"sign": -1.0}, {"unit": 1e-3}], ids=["sign", "unit"])
+def test_sign_and_unit_of_a_coordinate_change_no_estimate(change: dict[str, float], wind: float) -> None:
     other = dr.identify(spring(**change), log_of(wind=wind, **change))
     assert_same(answer(wind), other, 0.05)
     for name, error in answer(wind).standard_errors.items():
-        assert other.standard_errors[name] == pytest.approx(error, rel=0.1)
+        assert other.standard_errors[name] == pytest.approx(error, rel=0.05)
+
+
+@pytest.mark.parametrize(("wind", "errors"), [(0.0, 0.05), (0.1, 0.5)])
+def test_the_unit_of_time_changes_no_estimate_of_an_exact_model(wind: float, errors: float) -> None:
+    """Windows are a quarter of a second; other ones attribute gusts otherwise, within half a standard error."""
+    other = dr.identify(spring(time=0.25), log_of(wind=wind, time=0.25))
+    assert_same(answer(wind), other, errors)
 
 
 def test_the_order_of_logs_changes_no_estimate() -> None:

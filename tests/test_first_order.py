@@ -17,8 +17,8 @@ from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
 from diransac.errors import TimeLimitError
 from diransac.identification.assessment.inspection import inspect
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.estimate import TIME_LIMIT
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.regression import observers as search
 from diransac.identification.regression.multistart import least_squares
@@ -309,6 +309,23 @@ def test_a_state_that_nothing_measures_is_estimated(make, truth, simulate, names
     assert_exact(exact, truth)
     assert exact.verdict == "usable"
     assert_right(identified(make, simulate, names, 0.005, 0.1), truth, largest)
+
+
+@pytest.mark.parametrize(
+    ("make", "simulate", "name", "hidden"),
+    [(lagged_thrust, thrust_signals, "z", "thrust"), (flexible_joint, joint_signals, "motor", "load")],
+    ids=["thrust behind a lag", "load behind a spring"],
+)
+def test_a_state_that_nothing_measures_is_simulated_and_drawn(make, simulate, name, hidden, tmp_path):
+    result, log = identified(make, simulate, (name,)), recorded(simulate(), [name])
+    t, signals, _ = simulate()
+    simulated = dr.simulate(result, log)
+    expected = np.interp(simulated.time, t, signals[hidden])
+    assert np.abs(simulated[hidden] - expected).max() < 0.05 * np.ptp(expected)
+    dr.write_report(result, log, tmp_path / "page.html")
+    assert f'aria-label="{hidden} in {result.model.units[hidden]}, simulated over' in (
+        tmp_path / "page.html"
+    ).read_text(encoding="utf-8")
 
 
 def test_a_resonance_that_smoothing_takes_for_noise_is_found():

@@ -13,8 +13,8 @@ import diransac as dr
 from command_line import run
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import SettingsError
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.diagnosis import Resolution
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
 

@@ -361,7 +361,7 @@ def test_a_required_delay_is_estimated_though_no_evidence_asks_for_it():
 
 def test_a_required_lag_is_estimated_where_a_delay_is_likelier():
     """Without delays of sensors, which would make up for a part of the input's."""
-    timing = estimate(pendulum_log(delay=0.04), input_lag=True, max_recording_errors=0).resolution.timing
+    timing = estimate(pendulum_log(delay=0.04), input_lag=True, sensor_delays=()).resolution.timing
     assert timing.delay == 0.0
     assert 0.02 < timing.lag < 0.06
 

@@ -312,7 +312,7 @@ LEFT_OUT = [
     {"outliers": False},
     {"model_error": False},
     {"prior_model_error": 1e-5},
-    {"prior_discrepancy": 1e-6, "initial_discrepancy": 1e-6},
+    {"prior_discrepancy": 1e-6},
     {"input_delay": False, "input_lag": False},
     {"projection": False},
     {"prior_model_error": 0.0},

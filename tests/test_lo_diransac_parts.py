@@ -8,32 +8,27 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import ParameterLayout
-from diransac.identification.methods.lo_diransac import gauss_newton, integration_steps
-from diransac.identification.methods.lo_diransac.arrowhead import Arrowhead
-from diransac.identification.methods.lo_diransac.augmented_model import augmented_model
-from diransac.identification.methods.lo_diransac.corrections import ErrorKind
+from diransac.identification.core import minimise
+from diransac.identification.core.arrowhead import Arrowhead
+from diransac.identification.core.columns import signal_rates
+from diransac.identification.core.equations import JointEquations, cost, effect_on, linearize, variances_of_intervals
+from diransac.identification.core.fit import Fit, with_residuals
+from diransac.identification.core.minimise import Prior, refine_exact, refine_further
+from diransac.identification.core.noise import Mixture, lower_scale
+from diransac.identification.core.theta import ErrorKind
+from diransac.identification.core.windows import ShootingIntervals, augmented_model
+from diransac.identification.methods.lo_diransac import integration_steps
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
-from diransac.identification.methods.lo_diransac.joint_equations import JointEquations, effect_on, signal_rates
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
     residuals_of_motion,
     unexplained,
 )
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    Fit,
-    cost,
-    linearize,
-    variances_of_intervals,
-    with_residuals,
-)
 from diransac.identification.methods.lo_diransac.preparation import stuck_rows
 from diransac.identification.methods.lo_diransac.projection import projected_candidates, projected_parameters
-from diransac.identification.methods.lo_diransac.refinement import Prior, refine_exact, refine_further
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Samples, choose_half_widths, smooth
 from diransac.text_table import duration
 from simulated import MACHINES, as_log, flight, rollout
@@ -449,9 +444,9 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
     def failing(there, trial, weights):
         return cost(there, trial, weights) if trial is fit or not next(failures, False) else before + 1.0
 
-    monkeypatch.setattr(gauss_newton, "_CORRECTED", 0.0)
-    monkeypatch.setattr(gauss_newton, "cost", failing)
-    step = gauss_newton.gauss_newton_step(at, begin)
+    monkeypatch.setattr(minimise, "_CORRECTED", 0.0)
+    monkeypatch.setattr(minimise, "cost", failing)
+    step = minimise.gauss_newton_step(at, begin)
     assert cost(step.intervals, step.fit, weights) < before
     assert step.taken is None
     np.testing.assert_allclose(step.damping, following)

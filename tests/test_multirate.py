@@ -7,7 +7,7 @@ import diransac as dr
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset
 from diransac.identification.assessment.inspection import inspect
-from diransac.identification.evaluation.simulation import Simulation
+from diransac.identification.evaluation.simulation import Simulation, starts_of
 from simulated import MACHINES, flight
 
 PLANE = MACHINES["planar-rotorcraft"]
@@ -69,9 +69,9 @@ def test_errors_of_slow_signals_are_those_of_their_samples():
     names, parameters = (*POSITIONS, *VELOCITIES), np.array(list(PLANE.truth.values()))
     dataset = Dataset.of(MODEL, log(POSITIONS, VELOCITIES), names, pointwise=False)
     simulation, thresholds = Simulation(dataset), np.repeat([0.2, 0.1], 3)
-    found = simulation.score(parameters[None], thresholds, 3)
     one = dataset.segments[0]
-    ((_, state),) = simulation.starts[0]
+    starts = starts_of(one, "first")
+    found, ((_, state),) = simulation.score([starts], parameters[None], thresholds, 3), starts
     series = simulation.trajectories(0, parameters, state[None], np.array([0]), len(one))[0]
     errors = series[:, :6] - one.measured
     assert one.n_rows == N

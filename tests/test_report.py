@@ -15,7 +15,10 @@ from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
 import diransac as dr
+from diransac.data.dataset import Dataset
 from diransac.data.segment import bulk_range
+from diransac.identification.evaluation.prediction import predictions
+from diransac.identification.evaluation.scoring import judged_signals
 from diransac.report import figures, labelled, rendering
 from diransac.report.runs import simulate_on
 from diransac.simulation import RolloutBatch, rollouts
@@ -190,9 +193,11 @@ def test_what_is_no_result_is_refused(nothing, log, tmp_path):
 
 def predicted(result, log):
     """A changed result with the predictions of its log made again."""
-    run = simulate_on("it", result, log, result.diagnosis)
-    logs = (dataclasses.replace(result.logs[0], prediction=run.summary(result.diagnosis)),)
-    return dataclasses.replace(changed(result, logs=logs), predictions=run.validation.predictions)
+    recorded = log if result.diagnosis is None else log.measured
+    dataset = Dataset.of(result.model, recorded, judged_signals(result.model, [recorded], result.settings), given=[log])
+    (summary,) = predictions(result.estimate, result.evaluation, dataset)
+    logs = (dataclasses.replace(result.logs[0], prediction=summary),)
+    return dataclasses.replace(changed(result, logs=logs), predictions=dr.validate(result, log).predictions)
 
 
 def level_of(result, log, words):
@@ -433,7 +438,7 @@ def test_noise_outliers_and_unmodelled_accelerations_stand_in_a_table_with_units
 def test_a_page_without_a_diagnosis_has_no_such_section_and_starts_at_the_first_row(result, log, tmp_path):
     page = Page(written(result, log, tmp_path))
     assert "diagnosis" not in [a["id"] for a in page.all("section")]
-    assert "Each simulation starts at the first row" in page.text
+    assert "starts from a state that is estimated with the model, from the first samples" in page.text
     assert not page.all("path", "long")
 
 
@@ -450,42 +455,39 @@ def test_outliers_are_marked_in_their_own_signal_and_apart_from_rows_that_disagr
     assert set(HIT).isdisjoint(vertices(speed["measured"]["d"])[:, 0].tolist())
 
 
-def test_simulations_restart_from_smoothed_states_and_the_whole_log_simulation_is_drawn_too(model, log, tmp_path):
+def test_simulations_restart_after_the_judged_horizon_from_estimated_states(model, log, tmp_path):
     t = log.time - log.time[0]
     pushed = with_signals(log, thrust=log["thrust"] - 3.0 * np.sin(0.2 * t) ** 2)  # a part of the force is not logged
     found = dr.identify(model, pushed, seed=0)
-    run = simulate_on("it", found, pushed, found.diagnosis)
-    n_rows = round(run.restart_period / pushed.dt)
-    assert 5 <= len(pushed) / n_rows <= 25
-    begin, end = n_rows, 2 * n_rows
-    start = [
-        np.interp(pushed.time[begin], found.diagnosis.smoothed_time, x)
-        for x in found.diagnosis.smoothed_states.values()
-    ]
+    page = tmp_path / "report.html"
+    dr.write_report(found, pushed, page, horizon=1.0)
+    run = simulate_on("it", found, pushed, horizon=1.0)
+    assert run.restart_period == 1.0
+    begin, end = 50, 100
     batch = RolloutBatch(
-        [list(found.parameters.values())], np.array(start), pushed["thrust"][begin:end, None], pushed.dt
+        [list(found.parameters.values())], run.simulated[begin, :2], pushed["thrust"][begin:end, None], pushed.dt
     )
     expected = rollouts(model, substeps=found.estimate.resolution.substeps).trajectories(batch)[0]
     np.testing.assert_allclose(run.simulated[begin:end], expected, rtol=1e-12)
+    np.testing.assert_allclose(run.simulated[begin, :2], run.observations.measured[begin, :2], atol=0.05)
     drift = np.abs(run.open_loop - run.observations.measured).max(axis=0)
     assert (np.nanmax(np.abs(run.errors), axis=0)[:2] < drift[:2]).all()
-    page = Page(written(found, pushed, tmp_path))
-    assert "restarts every" in page.text
+    page = Page(page.read_text(encoding="utf-8"))
+    assert "restarts every 1 s" in page.text
     assert [a for name, a in figure_of(page, "x") if name == "whole-log simulation"]
 
 
-def test_beside_a_diagnosis_every_method_restarts_at_the_same_times(diagnosed, model, hit, tmp_path):
-    page = Page(written([dr.identify(model, hit, "ols"), diagnosed], hit, tmp_path))
+def test_every_method_restarts_at_the_same_times(diagnosed, model, hit, tmp_path):
+    ols = dr.identify(model, hit, "ols")
+    page = Page(written([ols, diagnosed], hit, tmp_path))
     assert [a["id"] for a in page.all("section")].count("diagnosis") == 1
     assert not page.all("path", "long")
     names = [name for name, _ in figure_of(page, "x")]
     assert "ols" in names
     assert "lo-diransac" in names
-    alone = simulate_on("ols", dr.identify(model, hit, "ols"), hit)
-    beside = simulate_on("ols", dr.identify(model, hit, "ols"), hit, diagnosed.diagnosis)
-    np.testing.assert_array_equal(alone.open_loop, beside.open_loop)
-    assert np.isfinite(beside.restart_period)
-    assert np.isinf(alone.restart_period)
+    runs = [simulate_on("", result, hit, horizon=1.0) for result in (ols, diagnosed)]
+    assert [run.restart_period for run in runs] == [1.0, 1.0]
+    assert [run.screened for run in runs] == [False, True]
 
 
 def test_a_held_out_log_is_not_assessed_by_another_logs_diagnosis(diagnosed, model, tmp_path):
@@ -518,7 +520,7 @@ def test_an_input_delay_is_reported_and_the_simulation_includes_it(model, log, t
     found = dr.identify(model, late, seed=0)
     assert level_of(found, late, "Inputs act 80 ms later than recorded, which the estimate includes") == "care"
     assert "The estimate and the simulations shown include it." in Page(written(found, late, tmp_path)).text
-    run = simulate_on("it", found, late, found.diagnosis)
+    run = simulate_on("it", found, late)
     assert run.median_errors["x_dot"] < 0.01 * np.ptp(log["x_dot"])
 
 
@@ -723,34 +725,3 @@ def test_numbers_are_printed_as_a_reader_expects_them():
     ]
     assert share(0.02, "its range") == "2 % of its range"
     assert share(19.3, "its range") == "19 times its range"
-
-
-# ---------------------------------------------------------------------- friction of robots
-
-
-def test_friction_of_each_joint_is_drawn_over_its_speed(tmp_path):
-    pytest.importorskip("mujoco", reason="FIGURES OF FRICTION NOT CHECKED: mujoco is missing")
-    arm, page = tmp_path / "arm.xml", tmp_path / "arm.html"
-    arm.write_text(
-        '<mujoco><compiler angle="radian"/><worldbody><body><joint name="elbow" axis="0 0 1"/>'
-        '<inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>'
-    )
-    model, t = dr.models.robot(arm, unknown=("armature", "damping", "friction")), np.arange(0.0, 6.0, 0.005)
-    v = np.gradient(np.sin(4.0 * t + 0.3 * t**2), t, edge_order=2)
-    friction = 0.5 * v + 0.8 * np.tanh(v / 0.05)
-    q = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.005)])
-    columns = {"elbow": q, "elbow_dot": v, "elbow_ddot": np.gradient(v, t, edge_order=2)}
-    log = dr.Log.from_arrays(t, columns | {"elbow_torque": 0.12 * columns["elbow_ddot"] + friction})
-    result = dr.identify(model, log, method="ols", input_hold="linear")
-    dr.write_report(result, log, page)
-    section = page.read_text().split('<section id="friction">')[1].split("</section>")[0]
-    (plot,) = re.findall(r"<svg.*?</svg>", section)
-    low, high, start, dt = (float(re.search(rf'data-{n}="(.*?)"', plot)[1]) for n in ("low", "high", "start", "dt"))
-    curve = re.search(r'data-name="fitted" d="M0 (-?\d+)h0((?:l\d+[ -]\d+)*)"', plot)
-    steps = [[int(x) for x in re.findall(r"-?\d+", step)] for step in curve[2].split("l")[1:]]
-    columns_, heights = np.cumsum([[0, int(curve[1])], *steps], axis=0).T
-    speed = start + dt * columns_
-    expected = 0.5 * speed + 0.8 * np.tanh(speed / 0.05)
-    assert high - heights / 1000.0 * (high - low) == pytest.approx(expected, abs=0.02 * (high - low))
-    assert "speed, rad/s" in section
-    assert "predicted force off by" in section

@@ -8,9 +8,7 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.data.input_timing import InputTiming
 from diransac.errors import LogError, SettingsError
-from diransac.identification.assessment.inverse_dynamics import force_errors
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.prediction.open_loop import OpenLoop
 from diransac.model.library import builtin
@@ -198,7 +196,8 @@ def test_signal_that_never_changes_has_no_fit():
     data = validation.to_dict()
     assert data["rmse"]["x"] == 0.0
     assert data["r_squared"]["x"] is None
-    assert "nan" in str(validation)
+    row = next(line.split() for line in str(validation).splitlines() if line.split()[:3] == ["whole", "log", "x"])
+    assert row[8:10] == ["–", "–"]
 
 
 # ---------------------------------------------------------------------- what is shown
@@ -220,9 +219,11 @@ def test_validation_is_ready_for_json_and_prints_every_signal_with_its_unit():
     assert [row["windows"] for row in data["horizons"]] == [10, 1]  # the first of 11 rows of 25 determines a state
     lines = str(validation).splitlines()
     assert lines[0].startswith(validation.verdict)
-    assert "whole log (1 window)" in lines
-    table = lines[lines.index("0.25 s (10 windows)") + 2 :]
-    assert [line.split()[:2] for line in table[:3]] == [["x", "m"], ["z", "m"], ["theta", "rad"]]
+    table = lines[next(k for k, line in enumerate(lines) if line.startswith("horizon")) + 1 :]
+    rows = [line.split() for line in table[: 2 * len(PLANE.signals)]]
+    assert [line.split()[2] for line in table[:3]] == ["x", "z", "theta"]
+    units = dict(zip(PLANE.signals, ["m", "m", "rad", "m/s", "m/s", "rad/s", "m/s^2", "m/s^2", "rad/s^2"], strict=True))
+    assert all(units[row[2]] in row for row in rows)
 
 
 @pytest.mark.parametrize("stiffness", [None, 400.0], ids=["measured force", "target"])
@@ -247,23 +248,8 @@ def test_relative_error_of_the_predicted_force_is_that_of_a_wrong_mass(stiffness
     validation = dr.validate(dr.Plant(model, {"mass": wrong}), log, input_hold="linear")
     expected = 100.0 * (wrong - mass) * np.linalg.norm(a) / np.linalg.norm(force)
     assert validation.force_error_percent["x"] == pytest.approx(expected, rel=0.02)
-    assert "force of the inputs" in str(validation)
+    assert "force error" in str(validation)
     assert validation.to_dict()["force_error_percent"]["x"] == validation.force_error_percent["x"]
-
-
-def test_spikes_of_an_input_are_in_no_predicted_force():
-    signals, inputs = flight(VEHICLE, 600, 0.02, substeps=4)
-    rng = np.random.default_rng(0)
-    noisy = signals + 1e-3 * signals.std(axis=0) * rng.normal(size=signals.shape)
-    late = np.vstack([inputs[1:], inputs[-1:]]) + 0.5 * rng.normal(size=inputs.shape)
-    spiked = late.copy()
-    spiked[17::40] += 60.0
-    delayed, plant = Resolution(timing=InputTiming(delay=0.02)), dr.Plant(builtin("underwater-vehicle"), VEHICLE.truth)
-    clean, found = (
-        force_errors(Dataset.of(plant.model, as_log(VEHICLE, noisy, u, 0.02)), [plant.parameters], delayed)["x"]
-        for u in (late, spiked)
-    )
-    assert found == pytest.approx(clean, rel=0.05)
 
 
 # ---------------------------------------------------------------------- windows that begin at smoothed states
@@ -318,14 +304,6 @@ def test_an_unstable_machine_is_judged_over_horizons_at_which_prediction_means_s
     assert right.judged.horizon < 2.0
     assert right.horizons[-1].robust_rmse["q"] > 1e6
     assert any("whole log is not judged" in text for text in right.findings)
-
-
-def test_one_step_innovations_of_the_true_model_are_white_and_of_unit_variance():
-    (right,) = dr.validate(scaled(), balanced(3, 0.05)).innovations
-    assert right.standard_deviation["q"] == pytest.approx(1.0, abs=0.1)
-    assert right.whiteness["q"] > 1e-3
-    (wrong,) = dr.validate(scaled(k=0.5), balanced(3, 0.05)).innovations
-    assert wrong.unmodelled > 3.0 * max(right.unmodelled, 1e-3)
 
 
 def test_trivial_predictions_are_scored_beside_the_model():
@@ -393,16 +371,6 @@ def test_a_log_that_is_too_short_for_its_noise_to_be_known_convicts_no_model():
     assert found.verdict == "usable with care"
     assert "10 rows" in found.findings[0]
     assert dr.validate(plant, hit, start="measured").verdict == "do not rely on this"
-
-
-def test_a_signal_that_ends_while_the_filter_settles_has_no_innovations():
-    log = sledge_log()
-    speed = np.gradient(log["x"], log.time)
-    speed[80:] = np.nan  # of 1000 rows, the first 99 do not count
-    beside = dr.Log.from_arrays(log.time, {**log.signals, "x_dot": speed})
-    (found,) = dr.validate(dr.Plant(SENSED, {"m": 2.0, "d": 1.0, "scale": 1.0}), beside).innovations
-    assert set(found.normalized) == {"x", "acc"}
-    assert set(found.standard_deviation) == set(found.coloured) | {"x", "acc"}
 
 
 def test_a_log_in_which_nothing_moves_says_so():

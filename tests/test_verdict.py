@@ -7,7 +7,6 @@ import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -147,7 +146,7 @@ def test_each_finding_against_a_result_has_an_action(cases, name):
 
 def test_five_findings_are_shown_and_the_others_counted():
     found = [Finding("care", f"Signal {k} is late", f"shift {k}") for k in range(7)]
-    found += [Finding("note", "Innovations are not white."), Finding("bad", "The time runs backwards", "sort the rows")]
+    found += [Finding("note", "Time stamps jitter."), Finding("bad", "The time runs backwards", "sort the rows")]
     few, more = shown(found)
     assert (len(few), more) == (5, 3)
     assert few[0] == "The time runs backwards; sort the rows."
@@ -236,10 +235,8 @@ def test_a_coordinate_at_rest_is_no_evidence_against_the_model():
     units = {"x_ddot": "m/s^2", "y_ddot": "m/s^2", "turn_ddot": "rad/s^2"}
     left = {"x_ddot": 0.1, "y_ddot": 1e-9, "turn_ddot": 1e-3}
     modelled = {"x_ddot": 0.9, "y_ddot": 0.0, "turn_ddot": 1e-3}
-    diagnosis = SimpleNamespace(unmodelled_accelerations={n: np.array([x, -x]) for n, x in left.items()})
-    observations = SimpleNamespace(model=SimpleNamespace(units=units))
-    accelerations = {n: np.full(5, x) for n, x in modelled.items()}
-    found = unexplained(diagnosis, SimpleNamespace(observations=observations, accelerations=accelerations))
+    unmodelled = {n: np.array([x, -x]) for n, x in left.items()}
+    found = unexplained(unmodelled, {n: np.full(5, x) for n, x in modelled.items()}, units)
     assert found == pytest.approx({"x_ddot": 0.1, "turn_ddot": 0.5})
 
 

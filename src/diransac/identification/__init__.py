@@ -10,10 +10,10 @@ fit an `Estimate` with its `Diagnosis`, and evaluates that.
 | `estimate.py`, `diagnosis.py`, `finding.py` | what a method returns: parameters; noise and forces; sentences |
 | `result.py`, `result_text.py`, `result_files.py` | `Result`; as text; as files |
 | `serialization.py` | JSON of dataclasses by their annotations |
+| `core/` | the estimator: windows, unknowns, equations, the one loop |
 | `regression/` | parameters from rows of equations |
 | `structure/` | what a model and a log determine; terms that a model may lack |
 | `evaluation/` | an estimate against its logs; findings |
-| `prediction/` | open-loop prediction of logs |
 | `methods/` | the methods |
 | `prediction/` | open-loop prediction of logs, of `identify` and `validate` alike |
 | `assessment/` | inspection of logs, validation of models |

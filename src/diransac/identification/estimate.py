@@ -293,8 +293,8 @@ class HorizonScores:
         ``100 (1 - |y - y_sim| / |y - mean(y)|)``.
     r_squared : mapping of str to float
         ``1 - sum (y - y_sim)^2 / sum (y - mean(y))^2``.
-    robust_rmse, robust_fit_percent, robust_r_squared : mapping of str to float
-        The same without outliers.
+    robust_rmse : mapping of str to float
+        The first without outliers.
     hold_last : mapping of str to float
         RMSE, without outliers, of the prediction that nothing changes after the start of a window.
     constant_velocity : mapping of str to float
@@ -316,8 +316,6 @@ class HorizonScores:
     fit_percent: Values
     r_squared: Values
     robust_rmse: Values
-    robust_fit_percent: Values
-    robust_r_squared: Values
     hold_last: Values
     constant_velocity: Values
     relative_error: Values

@@ -323,7 +323,7 @@ class _Task:
                 dataclasses.replace(estimate, disagreements=(*estimate.disagreements, *named)), len(logs)
             ),
             evaluation=evaluation,
-            logs=_summaries(dataset, evaluation, named, predictions(estimate, evaluation, dataset, scoring, criteria)),
+            logs=_summaries(dataset, evaluation, named, predictions(estimate, evaluation, dataset)),
             notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *incomparable),
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),

@@ -8,7 +8,7 @@ Begin with `write_report`.
 | `runs.py` | results simulated over the logs: the numbers behind every section |
 | `sections.py`, `provenance.py` | tables and texts; equations, settings and versions |
 | `figures.py` | geometry of SVG figures |
-| `over_time.py`, `friction.py` | signals, residuals and forces over time; friction over speed |
+| `over_time.py` | signals, residuals and forces over time |
 | `tracking.py`, `stores.py` | pages of tracked runs, and of studies and fleets |
 | `rendering.py`, `templates/` | Jinja templates |
 | `viewer.py` | recordings for the Rerun viewer |
@@ -24,7 +24,6 @@ from diransac.data.log import Log
 from diransac.errors import ResultError
 from diransac.identification.result import Result
 from diransac.report import provenance, sections
-from diransac.report.friction import friction_figures
 from diransac.report.over_time import figures_of
 from diransac.report.rendering import numbered, write_page
 from diransac.report.runs import Entry, simulate_all
@@ -113,7 +112,6 @@ def _content(entries: Sequence[Entry], logs: Sequence[Log]) -> dict[str, Any]:
         "suggestions": sections.suggestions(entries),
         "competitions": sections.competitions(entries),
         "logs": [figures_of(log, runs, len(logs)) for log, runs in zip(logs, by_log, strict=True)],
-        "friction": friction_figures(entries),
         "scores": [(runs[0].log_name, [sections.scores(run) for run in runs]) for runs in by_log],
         "equations": [provenance.model_text(model) for model in models],
         "settings": provenance.settings(entries),

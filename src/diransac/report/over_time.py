@@ -72,22 +72,12 @@ def figures_of(log: Log, runs: Sequence[Run], n_logs: int) -> LogFigures:
 
 def _method(runs: Sequence[Run]) -> str:
     """Starting points of the simulations."""
-    restarted = [run for run in runs if np.isfinite(run.restart_period)]
-    if not restarted:
-        return "Each simulation starts at the first row and depends on the inputs alone."
-    state = restarted[0].restart_state
-    which = "" if len(restarted) == len(runs) else f" by {', '.join(run.label for run in restarted)}"
-    if not any(run.restarts_within for run in restarted):
-        return f"Each simulation{which} starts at the first {state} state and depends on the inputs alone."
-    period = number(restarted[0].restart_period)
-    text = (
-        f"Each simulation{which} depends on the inputs alone and restarts every {period} s from the {state} "
-        "state, so that the effect of unmodelled forces does not accumulate."
-    )
-    if len(runs) > 1:
-        return text
-    agreeing = "" if runs[0].held_out else "; the inliers are the rows that agree with it"
-    return f"{text} The faint line is one simulation of the whole log{agreeing}."
+    about = "Each simulation depends on the inputs alone, and starts from a state that is estimated with the model"
+    periods = dict.fromkeys(number(run.restart_period) for run in runs if np.isfinite(run.restart_period))
+    if not periods:
+        return f"{about}, from the first samples."
+    text = f"{about} from the samples before: it restarts every {' or '.join(periods)} s, the judged horizon."
+    return text if len(runs) > 1 else f"{text} The faint line is one simulation of the whole log."
 
 
 def _legend(runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> list[tuple[str, str]]:
@@ -108,7 +98,7 @@ def _legend(runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> 
 
 def _shows_both(runs: Sequence[Run]) -> bool:
     """True if the whole-log simulation is drawn too, which is readable for a single result only."""
-    return len(runs) == 1 and runs[0].restarts_within
+    return len(runs) == 1 and bool(np.isfinite(runs[0].restart_period))
 
 
 def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Timeline) -> Figure:
@@ -122,15 +112,17 @@ def _signal(name: str, runs: Sequence[Run], marking: Run, log: Log, timeline: Ti
         whole = _column(shown.open_loop, shown, name)
         traces.append(Trace("whole-log simulation", "m0 long", "line", shown.rows, whole))
     facts = [_median_error(name, run, unit, label=f"{run.label} " * (len(runs) > 1)) for _, run in having]
-    beyond = _beyond(shown.observations.column(name), scale)
-    about = f"{name} in {unit}, measured and simulated over {number(timeline.dt * (timeline.n_rows - 1))} s"
+    measured = shown.observations.column(name)
+    beyond, is_measured = _beyond(measured, scale), bool(np.isfinite(measured).any())
+    what = "measured and simulated" if is_measured else "simulated"
+    about = f"{name} in {unit}, {what} over {number(timeline.dt * (timeline.n_rows - 1))} s"
     bands = _bands(shown, log, timeline)
     plot = time_plot(traces, scale, timeline, about, full=beyond and beyond[:2], bands=bands)
     return Figure(
         title=name,
         unit=unit,
-        facts=(f"median error{':' * (len(runs) > 1)} {'; '.join(facts)}",),
-        plots=(plot, _residuals(name, having, shown, timeline)),
+        facts=(f"median error{':' * (len(runs) > 1)} {'; '.join(facts)}" if is_measured else "not measured",),
+        plots=(plot, _residuals(name, having, shown, timeline)) if is_measured else (plot,),
         time_ticks=time_axis(timeline),
         beyond=_beyond_text(beyond),
     )
@@ -270,7 +262,7 @@ def _level(name: str, run: Run) -> tuple[float, str]:
     """Reference value of the residuals, 0 without one, and its name."""
     if run.screened:
         return 3.0 * run.noise.get(name, 0.0), "three standard deviations of the noise"
-    return float(run.thresholds[run.observations.signals.index(name)]), "the inlier threshold"
+    return run.thresholds.get(name, 0.0), "the inlier threshold"
 
 
 def _residual_scale(ranges: Sequence[tuple[float, float]], is_shown: Sequence[bool], visible: float) -> Scale:
@@ -298,7 +290,9 @@ def _unmodelled(run: Run, found: Diagnosis, i: int, log: Log, timeline: Timeline
     bands = _bands(run, log, timeline)
     for name, values in (found.unmodelled_forces or found.unmodelled_accelerations).items():
         what, unit = _name_and_unit(run.result.model, name, is_force=bool(found.unmodelled_forces))
-        rms, fraction = float(np.sqrt(np.mean(np.square(values)))), run.unexplained.get(name)
+        rms, summary = float(np.sqrt(np.mean(np.square(values)))), run.view.summary
+        shares = summary.prediction.unexplained if summary and summary.prediction else {}
+        fraction = shares.get(name)
         relative = "no motion" if fraction is None else f"{percent(fraction)} of the acceleration"
         least = _VISIBLE * rms / fraction if fraction else 0.0
         scale = padded(min(-least, float(values.min())), max(least, float(values.max())))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,23 +13,13 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
-from diransac.data.segment import Segment
+from diransac.data.segment import Segment, bulk_range
 from diransac.errors import LogError, ResultError, SettingsError
-from diransac.identification.assessment.validation import Validation, validate
+from diransac.identification.assessment.validation import Validation, validated
 from diransac.identification.diagnosis import Departure, Diagnosis, departures
 from diransac.identification.estimate import LogSummary
-from diransac.identification.evaluation.prediction import (
-    Restarts,
-    SimulatedLog,
-    diagnosed_parts,
-    restarts_of,
-    simulated_parts,
-    simulated_rows,
-    unexplained,
-)
-from diransac.identification.evaluation.scoring import Scoring, as_estimated, choose_scoring, judged_signals
-from diransac.identification.evaluation.simulation import Simulation
-from diransac.identification.prediction.open_loop import OpenLoop
+from diransac.identification.evaluation.scoring import choose_scoring, judged_signals
+from diransac.identification.prediction.open_loop import derived_velocities
 from diransac.identification.result import Result
 from diransac.report.rendering import numbered
 from diransac.simulation import inlier_mask
@@ -76,7 +67,7 @@ def log_view(result: Result, log: Log) -> LogView:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(SimulatedLog):
+class Run:
     """One result simulated over one log.
 
     Parameters
@@ -85,20 +76,32 @@ class Run(SimulatedLog):
     log_name : name of the log on the page
     result : the result
     view : the result restricted to this log
+    observations : the model over the log, N rows of n_s signals: measured ones, and states that nothing measures
     first_row : row of the log that is row 0 here
-    open_loop : (N, n_s)   simulated through the whole log from its first row; inliers are defined by it, those of a
-        held-out log by the restarted simulation
-    validation : open-loop scores at several horizons, or the reason why there are none
-    screened : True if the noise and the outliers of the log are known
+    simulated : (N, n_s)   simulated from the states of `validate`, again after each judged horizon; NaN in gaps
+    open_loop : (N, n_s)   simulated through the whole log
+    thresholds : inlier threshold of each signal that has one
+    inliers : (N,)   rows that agree with one simulation of the whole log, in the identification; those of a held-out
+        log with the restarted simulation
+    noise : standard deviation of the noise of each signal, as far as it is known
+    outliers : (N,) samples of each signal that are outliers
+    validation : open-loop scores at several horizons
+    screened : True if the result separates outliers, or the log is held out: they are known
     """
 
     label: str
     log_name: str
     result: Result
     view: LogView
+    observations: Segment
     first_row: int
+    simulated: FloatArray
     open_loop: FloatArray
-    validation: Validation | str
+    thresholds: Mapping[str, float]
+    inliers: BoolArray
+    noise: Mapping[str, float]
+    outliers: Mapping[str, BoolArray]
+    validation: Validation
     screened: bool
 
     @property
@@ -107,24 +110,59 @@ class Run(SimulatedLog):
         return self.view.summary is None
 
     @property
-    def restart_state(self) -> str:
-        """Kind of the states from which the simulation restarts."""
-        return "smoothed" if self.screened else "measured"
-
-    @property
-    def restarts_within(self) -> bool:
-        """True if the simulation restarts before the end of the log."""
-        return bool(self.restart_period < (len(self.observations) - 1) * self.observations.log.dt)
+    def restart_period(self) -> float:
+        """Time after which the simulation restarts, s: the judged horizon; infinite: never."""
+        return self.validation.judged.horizon
 
     @property
     def rows(self) -> IntArray:
         """Rows of the log (N,)."""
         return np.arange(self.first_row, self.first_row + len(self.observations))
 
+    @cached_property
+    def errors(self) -> FloatArray:
+        """Simulated less measured signals ``(N, n_s)``, NaN where either is missing."""
+        return _errors(self.simulated, self.observations)
+
     @property
-    def unexplained(self) -> dict[str, float]:
-        """Share of each acceleration that the model leaves unexplained; empty if unknown."""
-        return {} if self.view.diagnosis is None else unexplained(self.view.diagnosis, self)
+    def inlier_fraction(self) -> float:
+        """Inliers over the rows that count."""
+        known = self.view.summary
+        return float(self.inliers.sum() / self.observations.n_rows) if known is None else known.inlier_fraction
+
+    @cached_property
+    def median_errors(self) -> dict[str, float]:
+        """Median size of the errors of each signal without outliers, in its unit; infinite after a divergence."""
+        found = {}
+        for name, error, y in zip(self.observations.signals, self.errors.T, self.observations.measured.T, strict=True):
+            counted = self.observations.valid & np.isfinite(y) & ~self.outliers[name]
+            sizes = np.where(np.isnan(error), np.inf, np.abs(error))[counted]
+            found[name] = float(np.median(sizes)) if len(sizes) else np.nan
+        return found
+
+    @cached_property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Range of the bulk of each signal's samples and of those close to the simulation; else of the simulation."""
+        found = {}
+        for k, name in enumerate(self.observations.signals):
+            measured, error = self.observations.measured[:, k], self.errors[:, k]
+            shown = measured if np.isfinite(measured).any() else self.simulated[:, k]
+            low, high = bulk_range(shown)
+            met = measured[np.abs(error) <= 0.5 * (high - low)]
+            found[name] = float(met.min(initial=low)), float(met.max(initial=high))
+        return found
+
+
+def _errors(simulated: FloatArray, observations: Segment) -> FloatArray:
+    """Simulated less measured signals ``(N, n_s)``; a quaternion that is measured whole has the sign that is nearer."""
+    model, signed = observations.model, simulated.copy()
+    for four in model.quaternions:
+        names = [model.signals[k] for k in four]
+        if set(names) <= set(observations.signals):
+            columns = [observations.signals.index(n) for n in names]
+            nearness = np.nansum(simulated[:, columns] * observations.measured[:, columns], axis=1, keepdims=True)
+            signed[:, columns] *= np.where(nearness < 0.0, -1.0, 1.0)
+    return signed - observations.measured
 
 
 @dataclass(frozen=True)
@@ -146,37 +184,20 @@ class Entry:
 def simulate_all(results: Mapping[str, Result], logs: Sequence[Log], horizon: float | None = None) -> list[Entry]:
     """Every result simulated over every log, and validated at a horizon, s; None: at those that suit the log.
 
-    A diagnosis is a property of the log and the machine: the first one of a log restarts the simulations of every
-    result over that log.
-
     Raises ResultError: a log cannot be simulated by a model.
     """
     names = numbered(log.source for log in logs)
-    diagnoses = [_diagnosis_of(results, log) for log in logs]
     return [
         Entry(
             label,
             result,
-            tuple(simulate_on(label, result, *one, horizon) for one in zip(logs, diagnoses, names, strict=True)),
+            tuple(simulate_on(label, result, log, name, horizon) for log, name in zip(logs, names, strict=True)),
         )
         for label, result in results.items()
     ]
 
 
-def _diagnosis_of(results: Mapping[str, Result], log: Log) -> Diagnosis | None:
-    """First diagnosis of the log among the results."""
-    own = (log_view(result, log).diagnosis for result in results.values())
-    return next((diagnosis for diagnosis in own if diagnosis is not None), None)
-
-
-def simulate_on(
-    label: str,
-    result: Result,
-    log: Log,
-    diagnosis: Diagnosis | None = None,
-    log_name: str | None = None,
-    horizon: float | None = None,
-) -> Run:
+def simulate_on(label: str, result: Result, log: Log, log_name: str | None = None, horizon: float | None = None) -> Run:
     """A result simulated over a log, which is preprocessed as the result's own was.
 
     Parameters
@@ -184,8 +205,6 @@ def simulate_on(
     label : name of the result on the page
     result : the result
     log : the log
-    diagnosis : of this log; with it, the simulation restarts periodically from the smoothed state, so that the effect
-        of unmodelled forces does not accumulate
     log_name : name of the log on the page; its source by default
     horizon : of `validate`, s
 
@@ -196,82 +215,57 @@ def simulate_on(
     """
     view = log_view(result, log)
     try:
-        return _simulate(result, view, log, diagnosis, horizon, label=label, log_name=log_name or log.source)
+        return _simulate(result, view, log, horizon, label=label, log_name=log_name or log.source)
     except (LogError, SettingsError) as error:
         raise ResultError(f'no report: model "{result.model.name}" cannot be simulated on this log: {error}') from error
 
 
-def _simulate(
-    result: Result, view: LogView, given: Log, diagnosis: Diagnosis | None, horizon: float | None, **names: Any
-) -> Run:
+def _simulate(result: Result, view: LogView, given: Log, horizon: float | None, **names: Any) -> Run:
     """The run of a result over a log."""
-    log = _prepared(result, view, given)
-    dataset = _dataset(result, log, given)
+    dataset = _dataset(result, _prepared(result, view, given), given)
     scoring = choose_scoring(dataset, result.settings)
-    dataset, stretches = as_estimated(dataset, view.diagnosis, result.settings)
-    simulation = Simulation(dataset, scoring.judged, result.estimate.resolution, stretches, threads=1)
-    observations, parameters = dataset.segments[0], result.model.parameter_vector(view.parameters)
-    first_row = observations.first_row_in(given)
-    validation = _validation(result, given, horizon)
-    held_out = OpenLoop(dataset, 0, view.parameters, result.estimate.resolution) if view.summary is None else None
-    begin = None if held_out is None else _estimated_starts(held_out, len(observations))
-    whole = simulated_rows(simulation, 0, parameters, observations, begin)
-    restarts = _restarts(observations, diagnosis, held_out, validation)
-    series = whole if restarts is None else simulated_rows(simulation, 0, parameters, observations, restarts)
-    open_loop = simulated_parts(observations, whole, None)["simulated"]
-    found = diagnosed_parts(observations, diagnosis, first_row)
-    screened = diagnosis is not None
-    if held_out is not None and held_out.smoothed is not None:
-        screened = True
-        found["noise"] = dict(zip(observations.signals, held_out.noise.tolist(), strict=True))
-        found["outliers"] = dict(zip(observations.signals, held_out.outliers.T, strict=True))
-    run = Run(
-        **simulated_parts(observations, series, restarts),
-        **found,
-        thresholds=_thresholds(result, view, dataset, scoring),
-        inliers=np.zeros(len(observations), bool),
+    validation, (loop,) = validated(result, given, horizon, result.estimate.resolution)
+    observed = dataset.segments[0]
+    acting = result.model.states_behind(observed.present)
+    hidden = set(acting) - {*observed.signals, *derived_velocities(observed, acting)}
+    observations = observed.with_signals((*observed.signals, *(n for n in result.model.state if n in hidden)))
+    rows = slice(observed.first_row_in(given), observed.first_row_in(given) + len(observed))
+    columns = [result.model.signals.index(n) for n in observations.signals]
+    first, n_rows = loop.segment.first_row_in(given), len(given)
+    restarted, whole = (
+        _in_rows(loop.simulated(h)[1], first, n_rows)[rows][:, columns] for h in (validation.judged.horizon, np.inf)
+    )
+    outliers = dict(zip(loop.segment.signals, _in_rows(loop.outliers, first, n_rows)[rows].T == 1.0, strict=True))
+    none = np.zeros(len(observed), bool)
+    thresholds = dict(zip(dataset.signals, scoring.thresholds.tolist(), strict=True))
+    if view.inliers is None:
+        errors = _errors(restarted, observations)[:, : len(observed.signals)]
+        finite = np.where(np.isnan(errors), np.inf, errors)
+        inliers = inlier_mask(finite, observed.valid, scoring.thresholds, scoring.min_inlier_signals)
+    else:
+        inliers, thresholds = view.inliers[rows], dict(result.evaluation.thresholds)
+    return Run(
         **names,
         result=result,
         view=view,
-        first_row=first_row,
-        open_loop=open_loop,
+        observations=observations,
+        first_row=rows.start,
+        simulated=restarted,
+        open_loop=whole,
+        thresholds=thresholds,
+        inliers=inliers,
+        noise=dict(zip(loop.segment.signals, loop.noise.tolist(), strict=True)),
+        outliers={n: outliers.get(n, none) for n in observations.signals},
         validation=validation,
-        screened=screened,
+        screened=loop.smoothed is not None and (view.summary is None or view.diagnosis is not None),
     )
-    return replace(run, inliers=_inliers(run, scoring))
 
 
-def _restarts(
-    observations: Segment, diagnosis: Diagnosis | None, held_out: OpenLoop | None, validation: Validation | str
-) -> Restarts | None:
-    """States at which the simulation restarts; of a held-out log, those of its validation, at the judged horizon."""
-    if diagnosis is not None:
-        return restarts_of(diagnosis, observations)
-    if held_out is None:
-        return None
-    horizon = np.inf if isinstance(validation, str) else validation.judged.horizon
-    n_rows = len(observations) if np.isinf(horizon) else max(1, round(horizon / observations.log.dt))
-    return _estimated_starts(held_out, n_rows)
-
-
-def _estimated_starts(held_out: OpenLoop, n_rows: int) -> Restarts:
-    """Initial states of windows of so many rows."""
-    rows = held_out.window_rows(n_rows)
-    return Restarts(rows, held_out.starts(rows)[0], n_rows)
-
-
-def _inliers(run: Run, scoring: Scoring) -> BoolArray:
-    """Inliers (N,): the result's own, or those of a held-out log by the thresholds of its scoring."""
-    if run.view.inliers is not None:
-        return run.view.inliers[run.rows]
-    finite = np.where(np.isnan(run.errors), np.inf, run.errors)
-    return inlier_mask(finite, run.observations.valid, scoring.thresholds, scoring.min_inlier_signals)
-
-
-def _thresholds(result: Result, view: LogView, dataset: Dataset, scoring: Scoring) -> FloatArray:
-    """Inlier thresholds (n_s,): the result's own in a log that it was identified from."""
-    own = result.evaluation.thresholds
-    return scoring.thresholds if view.summary is None else np.array([own.get(name, 0.0) for name in dataset.signals])
+def _in_rows(values: FloatArray | BoolArray, first: int, n_rows: int) -> FloatArray:
+    """Rows ``(n_rows, n)`` of a log, of which these are known from the first on; NaN in the others."""
+    found = np.full((n_rows, values.shape[1]), np.nan)
+    found[first : first + len(values)] = values
+    return found
 
 
 def _prepared(result: Result, view: LogView, log: Log) -> Log:
@@ -293,11 +287,3 @@ def _dataset(result: Result, log: Log, given: Log) -> Dataset:
         return Dataset.of(result.model, log, judged_signals(result.model, [log], result.settings), given=[given])
     except LogError:
         return Dataset.of(result.model, log, pointwise=False, given=[given])
-
-
-def _validation(result: Result, log: Log, horizon: float | None) -> Validation | str:
-    """Open-loop scores, or the reason why there are none."""
-    try:
-        return validate(result, log, horizon)
-    except (LogError, SettingsError) as error:
-        return str(error)

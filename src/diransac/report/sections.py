@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from diransac.data.log import Log
-from diransac.identification.assessment.innovations import Innovations
-from diransac.identification.assessment.validation import Validation
 from diransac.identification.diagnosis import Diagnosis
-from diransac.identification.estimate import HorizonScores
 from diransac.identification.evaluation.findings import bounds_text
 from diransac.identification.finding import Finding, Level, Verdict, next_line, shown, verdict_of
 from diransac.report.figures import Scale, Tick, padded, ticks
@@ -73,7 +69,7 @@ class Card:
 def card(entry: Entry) -> Card:
     """The verdict on one result: its own findings, or those of `validate` with the held-out logs of the page."""
     held_out, own = [run for run in entry.runs if run.held_out], entry.result.findings
-    found = [_findings_on(run) for run in held_out]
+    found = [run.validation.findings for run in held_out]
     groups = [
         (f"Held out, {_name(x)}", tuple(y for y in on if y not in own)) for x, on in zip(held_out, found, strict=True)
     ]
@@ -85,13 +81,6 @@ def card(entry: Entry) -> Card:
     levels: dict[Verdict, Level] = {"usable": "good", "usable with care": "care", "do not rely on this": "bad"}
     chosen = tuple((name, some) for name, some in listed if some)
     return Card(entry.label, levels[verdict], verdict, chosen, n_more, next_line(every))
-
-
-def _findings_on(run: Run) -> tuple[Finding, ...]:
-    """Findings of `validate` with a held-out log."""
-    if isinstance(run.validation, str):
-        return (Finding("care", f"Not scored: {run.validation}", "give a log that can be"), *run.result.findings)
-    return run.validation.findings
 
 
 def _name(run: Run) -> str:
@@ -344,59 +333,7 @@ def _delay(entry: Entry, found: Diagnosis) -> str:
     return f"{what}: {delay} ± {error} ms (standard error). The estimate and the simulations shown include it."
 
 
-def scores(run: Run) -> tuple[str, list[Table]]:
-    """Open-loop scores of one run, a table for each horizon, or a sentence on why there are none."""
-    validation = run.validation
-    if isinstance(validation, str):
-        return f"{run.label}: no scores: {validation}", []
-    tables = [_horizon_table(run.label, at, validation) for at in validation.horizons]
-    tables += [_innovation_table(run.label, one, validation) for one in validation.innovations]
-    forces = _force_table(run.label, validation)
-    return "", [*tables, forces] if forces else tables
-
-
-def _horizon_table(label: str, at: HorizonScores, validation: Validation) -> Table:
-    """Scores of one horizon, beside those of trivial predictions; robust ones where samples are left out of them."""
-    robust, three_digits = any(x > 0.0 for x in validation.outlier_fraction.values()), partial(number, digits=3)
-    columns: list[tuple[str, Mapping[str, float], Callable[[float], str]]] = [
-        ("RMSE", at.rmse, number),
-        *([("robust RMSE", at.robust_rmse, number)] if robust else []),
-        ("hold last", at.hold_last, number),
-        ("const. vel.", at.constant_velocity, number),
-        ("relative error", at.relative_error, percent),
-        ("fit %", at.fit_percent, three_digits),
-        *([("robust fit %", at.robust_fit_percent, three_digits)] if robust else []),
-        ("R²", at.r_squared, _r_squared),
-        *([("robust R²", at.robust_r_squared, _r_squared)] if robust else []),
-    ]
-    rows = [
-        (name, validation.units[name], *(text(x[name]) if name in x else "–" for _, x, text in columns))
-        for name in at.rmse
-    ]
-    judged = ", the judged horizon" if at is validation.judged else ""
-    lost = f", {at.diverged} diverged" if at.diverged else ""
-    header = ("Signal", "Unit", *(title for title, _, _ in columns))
-    return Table(header, rows, f"{label}: {at.name}{judged} ({plural(at.windows, 'window')}{lost})")
-
-
-def _innovation_table(label: str, one: Innovations, validation: Validation) -> Table:
-    """Consistency and whiteness of one-step innovations."""
-    rows = []
-    for name, x in one.autocorrelation.items():
-        largest = float(x[np.argmax(np.abs(x))])
-        probability = percent(one.whiteness[name])
-        rows.append((name, number(one.standard_deviation[name], 3), number(largest, 2), probability))
-    where = f" of {one.source}" if len(validation.innovations) > 1 else ""
-    caption = f"{label}: one-step innovations{where}; of a right model, of deviation 1 and white"
-    return Table(("Signal", "Normalised deviation", "Largest autocorrelation", "Probability, if white"), rows, caption)
-
-
-def _force_table(label: str, validation: Validation) -> Table | None:
-    """Relative error of the predicted force of each equation; None without one."""
-    caption = f"{label}: force of the inputs by inverse dynamics of the smoothed motion"
-    rows = [(name, percent(x / 100.0)) for name, x in validation.force_error_percent.items()]
-    return Table(("Equation", "RMS error over RMS force"), rows, caption) if rows else None
-
-
-def _r_squared(x: float) -> str:
-    return f"{x:.4f}".replace("-", "−") if abs(x) < 10.0 else number(x, 3)
+def scores(run: Run) -> Table:
+    """Open-loop scores of one run at every horizon, as `validate` prints them."""
+    header, *rows = run.validation.table()
+    return Table(header, rows, f"{run.label}; judged by {run.validation.judged.name}")

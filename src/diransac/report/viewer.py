@@ -184,7 +184,7 @@ def _send_replay(rerun: Any, recording: Any, above: list[str], run: Run) -> None
     assert found is not None
     interval = float(np.median(np.diff(found.smoothed_time)))
     for kind, horizon, colour in (("measured", interval, _MEASURED), ("predicted", run.restart_period, _PREDICTED)):
-        simulated = simulate(run.result, log, horizon=max(horizon, interval))
+        simulated = simulate(run.result, log, horizon=max(horizon, interval) if np.isfinite(horizon) else None)
         q = np.column_stack([simulated[name] for name in run.result.model.coordinates])
         every = max(1, round(1.0 / (50.0 * simulated.dt)))
         q, time = q[::every], simulated.time[::every]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,36 +119,21 @@ def cross_validate(
     if len(several) < 2:
         raise SettingsError("cross-validation leaves one log out; give at least two logs")
     arguments = {"compare_logs": False, **arguments}
+    folds = list[tuple[Result | str, Validation | str]]()
     with time_limited(time_limit):
-        folds = [_fold(model, several, i, method, horizon, progress, arguments) for i in range(len(several))]
+        for i, left_out in enumerate(several):
+            part = within(progress, i / len(several), (i + 1) / len(several), f"without log {i + 1}: ")
+            result: Result | str = "no model of the other logs"
+            try:
+                others = [*several[:i], *several[i + 1 :]]
+                answer = identify(model, others, method, progress=part, **arguments)
+                check_time()
+                result = answer
+                with time_unlimited():
+                    folds.append((answer, validate(answer, left_out, horizon)))
+            except SettingsError:
+                raise
+            except DiransacError as error:
+                folds.append((result, str(error)) if isinstance(result, Result) else (str(error), result))
     results, validations = zip(*folds, strict=True)
     return CrossValidation(tuple(x.source for x in several), results, validations)
-
-
-def _fold(
-    model: Model,
-    logs: Sequence[Log],
-    i: int,
-    method: str | Method,
-    horizon: float | None,
-    progress: Callback | None,
-    arguments: Mapping[str, Any],
-) -> tuple[Result | str, Validation | str]:
-    """The result of all logs but the i-th and its validation with that log; reasons where there are none.
-
-    Raises SettingsError: an argument is out of range.
-    """
-    left_out, others = logs[i], [*logs[:i], *logs[i + 1 :]]
-    part = within(progress, i / len(logs), (i + 1) / len(logs), f"without log {i + 1}: ")
-    try:
-        result = identify(model, others, method, progress=part, **arguments)
-        check_time()
-    except SettingsError:
-        raise
-    except DiransacError as error:
-        return str(error), "no model of the other logs"
-    try:
-        with time_unlimited():
-            return result, validate(result, left_out, horizon)
-    except DiransacError as error:
-        return result, str(error)

@@ -21,12 +21,11 @@ from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.regression.uncertainty import jackknife_covariance
 from diransac.identification.settings import Settings
 from diransac.identification.structure.columns import contradictions
-from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
+from diransac.identification.structure.identifiability import equations_in_words, in_words, of_log
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
 from diransac.identification.structure.structural import structural
 from diransac.model import Model
-from diransac.model.parameter import Parameter
 from diransac.text_table import aligned, percent
 
 
@@ -222,12 +221,8 @@ def inspect(
     if model is None and fixed:
         raise SettingsError("parameters are fixed without a model; give the model, too")
     several, model = as_logs(logs), None if model is None else KnownParameters.of(model, fixed, None).free()
-    first, *others = (_contents(log, model) for log in several)
-    fitness = None if model is None else _fitness(several, model)
-    if model is not None and fitness is not None and fitness.excitation and not fitness.reason:
-        mistakes = (f"{x.claim}; {x.action}" for x in contradictions(model, several))
-        spiked = _caveat([first, *others], model)
-        fitness = dataclasses.replace(fitness, caveat="; ".join(filter(None, [*mistakes, spiked])))
+    first, *others = contents = [_contents(log, model) for log in several]
+    fitness = None if model is None else _fitness(several, model, contents)
     return dataclasses.replace(first, fitness=fitness, others=tuple(others))
 
 
@@ -286,11 +281,11 @@ def _cells(facts: SignalFacts) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- a model
 
 
-def _fitness(logs: Sequence[Log], model: Model) -> Fitness:
+def _fitness(logs: Sequence[Log], model: Model, contents: Sequence[Inspection]) -> Fitness:
     missing = tuple(name for name in model.required_signals if any(name not in log for log in logs))
     derived = [_derived(log, model) for log in logs] if missing else logs
     derivable = tuple(name for name in missing if all(name in log for log in derived))
-    excitation, reason = dict[str, Excitation](), ""
+    excitation, reason, caveats = dict[str, Excitation](), "", list[str]()
     if derivable != missing:
         later = "lo-diransac estimates them; excitation is known only after identification"
         reason = "" if set(missing) & set(model.inputs) else later
@@ -302,23 +297,16 @@ def _fitness(logs: Sequence[Log], model: Model) -> Fitness:
             excitation, reason = _excitation(model, derived)
         except (LogError, IdentificationError) as error:
             reason = str(error)
-    return Fitness(model.name, missing, derivable, excitation, reason, bases=_bases(logs, model))
-
-
-def _bases(logs: Sequence[Log], model: Model) -> dict[str, str]:
-    """Rates by name -> the coordinate that they are derivatives of, where a log lacks it."""
-    lacking = {name for name in model.coordinates if any(name not in log for log in logs)}
-    chains = [chain for chain in model.chains if chain[0] in lacking]
-    return {name: chain[0] for chain in chains for name in chain[1:]}
-
-
-def _caveat(logs: Sequence[Inspection], model: Model) -> str:
-    """A warning of spikes in the signals of the equations; empty without them."""
-    having = {name for log in logs for name, facts in log.signals.items() if facts.n_spikes}
-    spiked = [name for name in model.required_signals if name in having]
-    if not spiked:
-        return ""
-    return f"spikes in {', '.join(spiked)} bias these estimates and errors: pass --despike, or use those of identify"
+    if excitation and not reason:
+        caveats = [f"{x.claim}; {x.action}" for x in contradictions(model, logs)]
+        spiked = [n for n in model.required_signals if any(n in x.signals and x.signals[n].n_spikes for x in contents)]
+        if spiked:
+            bias = f"spikes in {', '.join(spiked)} bias these estimates and errors"
+            caveats.append(f"{bias}: pass --despike, or use those of identify")
+    # Rates that a log lacks, with the coordinate that it lacks, too.
+    chains = [x for x in model.chains if x[0] in model.coordinates and any(x[0] not in log for log in logs)]
+    bases = {name: chain[0] for chain in chains for name in chain[1:]}
+    return Fitness(model.name, missing, derivable, excitation, reason, "; ".join(caveats), bases)
 
 
 def _derived(log: Log, model: Model) -> Log:
@@ -329,12 +317,6 @@ def _derived(log: Log, model: Model) -> Log:
         return log
 
 
-def _not_excited(ambiguous: Sequence[Ambiguity], parameters: Mapping[str, Parameter]) -> dict[str, Excitation]:
-    """Excitation of parameters that are not identifiable."""
-    names = [name for x in ambiguous for name in x.names]
-    return {name: Excitation(parameters[name].unit, np.nan, np.inf) for name in names}
-
-
 def _excitation(model: Model, logs: Sequence[Log]) -> tuple[dict[str, Excitation], str]:
     """Excitation of each parameter; where some are not identifiable, of those alone, with the reason.
 
@@ -343,16 +325,18 @@ def _excitation(model: Model, logs: Sequence[Log]) -> tuple[dict[str, Excitation
     model = model.with_sensors(usable_sensors(model, logs, regression=True)[0])
     dataset = Dataset.of(model, logs)
     check_motion(dataset)
+    own = dict(zip(dataset.layout.names, dataset.layout.bounds, strict=True))
     ambiguous = structural(model, ranges=dataset.ranges)
+    words = equations_in_words(ambiguous)
+    if not ambiguous:
+        bound = OrdinaryLeastSquares().bind(dataset)
+        rows = np.arange(bound.n_rows)
+        selected = bound.select([rows])
+        ambiguous = () if selected.well_defined()[0] else of_log(list(own), bound.null_space())
+        words = in_words(ambiguous, len(logs))
     if ambiguous:
-        return _not_excited(ambiguous, model.parameters), equations_in_words(ambiguous)
-    bound, layout = OrdinaryLeastSquares().bind(dataset), dataset.layout
-    own = dict(zip(layout.names, layout.bounds, strict=True))
-    rows = np.arange(bound.n_rows)
-    selected = bound.select([rows])
-    if not selected.well_defined()[0]:
-        ambiguous = of_log(list(own), bound.null_space())
-        return _not_excited(ambiguous, own), in_words(ambiguous, len(logs))
+        names = [name for x in ambiguous for name in x.names]
+        return {n: Excitation((own.get(n) or model.parameters[n]).unit, np.nan, np.inf) for n in names}, words
     estimates = selected.fit()[0]
     errors = np.sqrt(np.diag(jackknife_covariance(bound, rows)))
     relative = np.divide(errors, np.abs(estimates), out=np.full(len(errors), np.inf), where=estimates != 0.0)

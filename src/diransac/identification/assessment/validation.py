@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -11,17 +11,18 @@ import numpy as np
 from diransac.data.dataset import Dataset, as_logs
 from diransac.data.log import Log
 from diransac.errors import SettingsError
-from diransac.identification.assessment.innovations import Innovations, innovations
 from diransac.identification.assessment.open_loop import resolution_of
+from diransac.identification.diagnosis import Resolution
 from diransac.identification.estimate import HorizonScores, Predictions
 from diransac.identification.evaluation.findings import findings_of
 from diransac.identification.evaluation.verdict import findings_of_predictions
 from diransac.identification.finding import Finding, Verdict, by_seriousness, next_line, shown_lines, verdict_of
 from diransac.identification.prediction.horizons import predictions_of
-from diransac.identification.prediction.open_loop import StartRule
+from diransac.identification.prediction.inverse import force_errors
+from diransac.identification.prediction.open_loop import OpenLoop, StartRule
 from diransac.identification.result import Result
 from diransac.model.plant import ModelWithParameters, as_plant
-from diransac.text_table import aligned, listed, number, percent
+from diransac.text_table import aligned, number, percent
 
 _CORRECT = "identify from this log, too, with --with-suggestions for terms that the model lacks"
 
@@ -47,8 +48,6 @@ class Validation:
         Relative error of the force of the inputs in the equation of each coordinate or velocity, as inverse dynamics
         predict it from the smoothed motion: RMS error over the RMS of the force, %.  The force of a target under
         position control is stiffness times target less position.
-    innovations : tuple of Innovations, optional
-        One-step innovations of each log that can be smoothed.
     """
 
     source: str
@@ -57,7 +56,6 @@ class Validation:
     findings: tuple[Finding, ...]
     notes: tuple[str, ...] = ()
     force_error_percent: Mapping[str, float] = field(default_factory=dict)
-    innovations: tuple[Innovations, ...] = ()
 
     @property
     def horizons(self) -> tuple[HorizonScores, ...]:
@@ -97,88 +95,43 @@ class Validation:
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON (a figure that is not finite becomes null)."""
         rows = [{k: _finite(x) for k, x in vars(scores).items()} for scores in self.horizons]
-        top = {
-            k: rows[self.predictions.asked][k] for k in ("horizon", "rmse", "fit_percent", "r_squared", "robust_rmse")
-        }
+        top = rows[self.predictions.asked]
         return {
             "log": self.source,
             "verdict": self.verdict,
             "findings": [x.to_dict() for x in self.findings],
-            **top,
+            **{k: top[k] for k in ("horizon", "rmse", "fit_percent", "r_squared", "robust_rmse")},
             "units": dict(self.units),
             "horizons": rows,
             "force_error_percent": _finite(self.force_error_percent),
             "outlier_fraction": dict(self.outlier_fraction),
-            "innovations": [_finite(one.to_dict()) for one in self.innovations],
             "notes": list(self.notes),
         }
 
     def __str__(self) -> str:
-        forces = [["force of the inputs", "relative error %"]]
-        forces += [[n, f"{x:.1f}"] for n, x in self.force_error_percent.items()]
         parts = [
             [f"{self.verdict}: {self.source}", *shown_lines(self.findings, good=True)],
-            *([*_head(scores), *aligned(self._rows(scores))] for scores in self.horizons),
-            aligned(forces) if self.force_error_percent else [],
-            *(_innovation_lines(one) for one in self.innovations),
+            aligned(self.table()),
             [next_line(self.findings, "use the model: diransac export RESULT.json -o dynamics.c")],
         ]
-        return "\n\n".join("\n".join(lines) for lines in parts if lines)
+        return "\n\n".join("\n".join(lines) for lines in parts)
 
-    def _rows(self, scores: HorizonScores) -> list[list[str]]:
-        """Table of one horizon."""
-        rows = [["signal", "unit", "RMSE", "robust", "hold last", "const. vel.", "fit %", "robust", "R^2", "robust"]]
-        for name in scores.rmse:
-            errors = (scores.rmse, scores.robust_rmse, scores.hold_last, scores.constant_velocity)
-            fits = (scores.fit_percent, scores.robust_fit_percent)
-            texts = [*(f"{x[name]:.4g}" for x in errors), *(_short(x[name], 1) for x in fits)]
-            texts += [_short(x[name], 4) for x in (scores.r_squared, scores.robust_r_squared)]
-            rows.append([name, self.units[name], *texts])
+    def table(self) -> list[list[str]]:
+        """Rows of a table with a header: each signal at each horizon, beside the error of the force of its equation."""
+        rows = [["horizon", "signal", "error", "RMSE", "robust", "trivial", "unit", "fit %", "R²", "windows"]]
+        for x in self.horizons:
+            windows = f"{x.windows}" + (f", {x.diverged} diverged" if x.diverged else "")
+            for name in x.rmse:
+                error = percent(x.relative_error[name]) if name in x.relative_error else "–"
+                trivial = float(np.fmin(x.hold_last[name], x.constant_velocity[name]))
+                errors = map(number, (x.rmse[name], x.robust_rmse[name], trivial))
+                fits = number(x.fit_percent[name], 3), number(x.r_squared[name])
+                rows.append([x.name, name, error, *errors, self.units[name], *fits, windows])
+        if self.force_error_percent:
+            rows[0].append("force error")
+            forces = {n: percent(x / 100.0) for n, x in self.force_error_percent.items()}
+            rows[1:] = [[*row, forces.get(row[1], "–")] for row in rows[1:]]
         return rows
-
-
-# ---------------------------------------------------------------------- findings
-
-
-def _findings(
-    plant: ModelWithParameters, logs: tuple[Log, ...], found: Predictions, of_logs: Sequence[Innovations]
-) -> tuple[Finding, ...]:
-    """Findings for and against a plant by the prediction of some logs, and on the identification of a result."""
-    if not isinstance(plant, Result):
-        return by_seriousness([*findings_of_predictions(found, _CORRECT), *_of_innovations(of_logs)])
-    held_out = any(plant.index_of(log) is None for log in logs)
-    return by_seriousness([*findings_of(plant, found, _CORRECT if held_out else ""), *_of_innovations(of_logs)])
-
-
-def _of_innovations(of_logs: Sequence[Innovations]) -> Iterator[Finding]:
-    """Innovations that are not white."""
-    for one in of_logs:
-        if one.coloured:
-            names = listed([f"{n} ({number(x, 2)})" for n, x in one.coloured.items()])
-            where = f" of {one.source}" if len(of_logs) > 1 else ""
-            yield Finding("note", f"One-step innovations{where} are not white, with autocorrelations of {names}.")
-
-
-def _short(x: float, decimals: int) -> str:
-    """A score with decimals, as long as it is no disaster."""
-    return f"{x:.{decimals}f}" if abs(x) < 1e4 else f"{x:.3g}"
-
-
-def _head(scores: HorizonScores) -> list[str]:
-    """Heading of a table: horizon and number of windows."""
-    windows = f"{scores.windows} window{'s' * (scores.windows > 1)}"
-    lost = f", {scores.diverged} diverged" if scores.diverged else ""
-    return [f"{scores.name} ({windows}{lost})"]
-
-
-def _innovation_lines(one: Innovations) -> list[str]:
-    """Table of the innovations of a log."""
-    rows = [["innovation", "normalised std", "autocorrelation", "P(white)"]]
-    for name, x in one.autocorrelation.items():
-        largest = x[np.argmax(np.abs(x))]
-        rows.append([name, f"{one.standard_deviation[name]:.3g}", f"{largest:.2f}", f"{one.whiteness[name]:.2g}"])
-    forces = f"unmodelled forces of {percent(one.unmodelled)} of the changes of velocity"
-    return [f"one-step innovations of {one.source}, with {forces}", *aligned(rows)]
 
 
 # ---------------------------------------------------------------------- entry
@@ -230,13 +183,23 @@ def validate(
     SettingsError
         An argument is of another type, or unknown, or a horizon is shorter than a sample.
     """
+    return validated(plant, logs, horizon, resolution_of(plant, integrator, substeps, input_hold), start)[0]
+
+
+def validated(
+    plant: ModelWithParameters,
+    logs: Log | Iterable[Log],
+    horizon: float | None,
+    resolution: Resolution,
+    start: StartRule = "smoothed",
+) -> tuple[Validation, list[OpenLoop]]:
+    """Scores as `validate` returns them, and the predictions of each log."""
     several = as_logs(logs)
     if horizon is not None and not isinstance(horizon, (int, float, np.number)):
         raise SettingsError(f"horizon is {horizon!r:.60}; give seconds")
     if start not in get_args(StartRule):
         raise SettingsError(f"start is {start!r:.60}; there are {', '.join(get_args(StartRule))}")
     known = as_plant(plant)
-    resolution = resolution_of(plant, integrator, substeps, input_hold)
     dataset = Dataset.of(known.model, several, pointwise=False)
     own = [plant.parameters_in(log) if isinstance(plant, Result) else known.parameters for log in several]
     noise = None
@@ -244,18 +207,13 @@ def validate(
         horizon = plant.options.get("horizon") if horizon is None else horizon
         noise = None if plant.diagnosis is None else plant.diagnosis.noise_std
     loops, predictions = predictions_of(dataset, own, resolution, horizon, start, noise)
-    of_logs = tuple(x for x in map(innovations, loops) if x is not None)
-    from diransac.identification.assessment.inverse_dynamics import force_errors  # which needs all of lo-diransac
-
-    return Validation(
-        dataset.source,
-        {n: known.model.units[n] for n in dataset.signals},
-        predictions,
-        _findings(plant, tuple(several), predictions, of_logs),
-        dataset.notes,
-        force_errors(dataset, own, resolution),
-        of_logs,
-    )
+    if isinstance(plant, Result):
+        held_out = any(plant.index_of(log) is None for log in several)
+        findings = findings_of(plant, predictions, _CORRECT if held_out else "")
+    else:
+        findings = by_seriousness(findings_of_predictions(predictions, _CORRECT))
+    units = {n: known.model.units[n] for n in dataset.signals}
+    return Validation(dataset.source, units, predictions, findings, dataset.notes, force_errors(loops)), loops
 
 
 def _finite(x: object) -> object:

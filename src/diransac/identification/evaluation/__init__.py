@@ -6,7 +6,7 @@ a `Prediction` per log, logs that disagree, and the findings of a result.  Begin
 | file | contents |
 |---|---|
 | `simulation.py`, `scoring.py` | simulations of a dataset; weights, thresholds, `evaluate` |
-| `prediction.py` | a simulation of each log, row by row |
+| `prediction.py` | rows that count, weakest window and unexplained accelerations of each log |
 | `agreement.py` | logs that disagree with the others |
 | `findings.py`, `verdict.py` | findings of a result; those of predictions, from which the verdict follows |
 """

@@ -16,7 +16,6 @@ from diransac.time_limit import check_time
 
 _DELAY = "input delay [s]"
 """Name of the delay of the inputs in a sentence."""
-_ADVICE = "leave this log out, or give what differs a value per log"
 
 
 @runtime_checkable
@@ -47,30 +46,31 @@ def disagreements(
     """
     n, named, notes = len(dataset.segments), list[Disagreement](), list[str]()
     shared = [name for name, x in dataset.model.parameters.items() if not x.per_log]
-    found: dict[int, LogEstimate] = {}
+    estimates: dict[int, LogEstimate] = {}
     try:
         every = _each(method, dataset, seed, callback)
     except TimeLimitError:
         return named, ["the time limit was reached before the logs were compared with each other"]
     for i, own in enumerate(every):
         if not isinstance(own, str) and any(np.isfinite(own.standard_errors[name]) for name in shared):
-            found[i] = own
+            estimates[i] = own
         else:
             reason = own if isinstance(own, str) else "alone it tells too little of the parameters"
             notes.append(f"{dataset.given[i].source} could not be compared with the other logs: {reason}")
     # The probability, over all logs together, of naming a log that agrees is 0.1 %.
     level = 1e-3 / max(1, 2 * len(shared) * n)
-    while len(found) > 1:
-        tests = {i: _worst(found, i, shared, level, dataset.segments[i].log.dt) for i in found}
-        worst = max(found, key=lambda i: tests[i][0])
+    while len(estimates) > 1:
+        tests = {i: _worst(estimates, i, shared, level, dataset.segments[i].log.dt) for i in estimates}
+        worst = max(estimates, key=lambda i: tests[i][0])
         if tests[worst][0] <= 1.0:
             break
-        for i in list(found) if len(found) == 2 else [worst]:
+        for i in list(estimates) if len(estimates) == 2 else [worst]:
             _, name, text, late = tests[i]
-            alone = {x: found[i].parameters[x] for x in shared if np.isfinite(found[i].standard_errors[x])}
+            own = estimates.pop(i)
+            alone = {x: own.parameters[x] for x in shared if np.isfinite(own.standard_errors[x])}
             claim = f"{dataset.given[i].source} disagrees with the other logs: {text}"
-            named.append(Disagreement(claim, _ADVICE, "" if name == _DELAY else name, alone, late, i))
-            del found[i]
+            advice = "leave this log out, or give what differs a value per log"
+            named.append(Disagreement(claim, advice, "" if name == _DELAY else name, alone, late, i))
     return named, notes
 
 
@@ -103,42 +103,35 @@ def _alone(method: Method, dataset: Dataset, i: int, seed: int, callback: Callba
 
 
 def _worst(
-    found: Mapping[int, LogEstimate], i: int, parameters: Sequence[str], level: float, dt: float
+    estimates: Mapping[int, LogEstimate], i: int, parameters: Sequence[str], level: float, dt: float
 ) -> tuple[float, str, str, float]:
     """Largest difference of log ``i`` from the others over what is allowed, its name and text, and its delay, s."""
-    worst, named, text, late = 0.0, "", "", 0.0
-    t = student_quantile(min(x.degrees_of_freedom for x in found.values()), 1.0 - level)
-    for name in (*parameters, _DELAY):
-        own, variance = _marginal(found[i], name)
-        others = [_marginal(x, name) for j, x in found.items() if j != i]
-        others = [(p, v) for p, v in others if np.isfinite(v)]
-        if not np.isfinite(variance) or not others:
-            continue
-        mean, spread, ratio = _combined(others)
-        # A difference of 0.1 %, or of a quarter of a sample, is none, however narrow the intervals are.
-        allowed = max(t * np.sqrt(ratio * (variance + spread)), 1e-3 * abs(mean), 0.25 * dt if name == _DELAY else 0.0)
-        late = float(own - mean) if name == _DELAY else 0.0
-        surprise = abs(own - mean) / allowed if allowed > 0.0 else 0.0
-        if surprise > worst:
-            worst, named = float(surprise), name
-            text = f"{name} {own:.4g} ± {np.sqrt(variance):.2g} here, {mean:.4g} ± {np.sqrt(ratio * spread):.2g} there"
-    return worst, named, text, late
-
-
-def _marginal(found: LogEstimate, name: str) -> tuple[float, float]:
-    """A parameter, or the delay of the inputs, and its variance."""
-    if name == _DELAY:
-        return found.input_delay, found.input_delay_error**2
-    return found.parameters[name], found.standard_errors[name] ** 2
-
-
-def _combined(values: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
-    """Precision-weighted mean of (value, variance) pairs, its variance, and the Birge ratio, at least 1."""
-    p, v = np.array(values).T
+    names = (*parameters, _DELAY)
+    values, variances = np.array([_marginals(x, parameters) for x in estimates.values()]).swapaxes(0, 1)
     # Any estimate has an error by rounding.
-    v = np.maximum(v, np.square(1e-12 * np.abs(p).max()) + np.finfo(float).tiny)
-    least = v.min()
-    weights = least / v
-    mean = float(weights @ p / weights.sum())
-    chi_squared = float(weights @ np.square(p - mean) / least) / max(1, len(p) - 1)
-    return mean, float(least / weights.sum()), max(1.0, chi_squared)
+    variances = np.maximum(variances, np.square(1e-12 * np.abs(values).max(axis=0)) + np.finfo(float).tiny)
+    own = np.array(list(estimates)) == i
+    (value,), (variance,), others, spreads = values[own], variances[own], values[~own], variances[~own]
+    least = spreads.min(axis=0)
+    with np.errstate(invalid="ignore"):  # infinite variances of what no other log tells
+        weights = np.nan_to_num(least / spreads)
+        mean = (weights * others).sum(axis=0) / weights.sum(axis=0)
+        scatter = (weights * np.square(others - mean)).sum(axis=0) / least
+        birge = np.maximum(1.0, scatter / np.maximum(np.isfinite(spreads).sum(axis=0) - 1, 1))
+        spread = least / weights.sum(axis=0)
+        t = student_quantile(min(x.degrees_of_freedom for x in estimates.values()), 1.0 - level)
+        # A difference of 0.1 %, or of a quarter of a sample, is none, however narrow the intervals are.
+        least_allowed = np.append(1e-3 * np.abs(mean[:-1]), max(1e-3 * abs(mean[-1]), 0.25 * dt))
+        allowed = np.maximum(t * np.sqrt(birge * (variance + spread)), least_allowed)
+        surprise = np.nan_to_num(np.abs(value - mean) / allowed)
+    k = int(np.argmax(surprise))
+    here, there = f"{value[k]:.4g} ± {np.sqrt(variance[k]):.2g}", f"{mean[k]:.4g} ± {np.sqrt(birge[k] * spread[k]):.2g}"
+    late = float(value[k] - mean[k]) if names[k] == _DELAY else 0.0
+    return float(surprise[k]), names[k], f"{names[k]} {here} here, {there} there", late
+
+
+def _marginals(estimate: LogEstimate, parameters: Sequence[str]) -> tuple[list[float], list[float]]:
+    """Parameters and the delay of the inputs, and their variances."""
+    values = [estimate.parameters[n] for n in parameters]
+    errors = [estimate.standard_errors[n] for n in parameters]
+    return [*values, estimate.input_delay], np.square([*errors, estimate.input_delay_error]).tolist()

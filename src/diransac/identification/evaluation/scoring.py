@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, runs
+from diransac.arrays import BoolArray, FloatArray, IntArray, runs
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
 from diransac.data.segment import Segment
 from diransac.errors import LogError, SettingsError
 from diransac.identification.diagnosis import Diagnosis
 from diransac.identification.estimate import Estimate, Evaluation
-from diransac.identification.evaluation.simulation import Simulation, Stretch, stretches_of
+from diransac.identification.evaluation.simulation import Scores, Simulation, Start, starts_of
 from diransac.identification.settings import Settings
 from diransac.model import Model
 
@@ -158,95 +158,76 @@ def evaluate(estimate: Estimate, dataset: Dataset, scoring: Scoring, settings: S
     Evaluation
         The fit error is NaN, and there are no inliers, where a log lacks its initial state.
     """
-    acting, stretches = as_estimated(dataset, estimate.diagnosis, settings)
-    judged, weights = scoring.judged, scoring.weights[scoring.judged]
+    acting, judged = as_estimated(dataset, estimate.diagnosis), scoring.judged
     thresholds = {n: float(x) for n, x in zip(dataset.signals, scoring.thresholds, strict=True) if x > 0.0}
-    simulation = Simulation(acting, judged, estimate.resolution, stretches, settings.threads)
+    rows = np.cumsum([0, *map(len, dataset.given)])
     try:
-        simulation.starts  # noqa: B018  refuses a log without an initial state
+        starts = [
+            _starts(one, i, int(rows[i]) + one.offset, estimate.diagnosis, settings.initial_state)
+            for i, one in enumerate(acting.segments)
+        ]
     except LogError:
         nothing = acting.on_given_logs([np.zeros(len(one), dtype=bool) for one in acting.segments])
         unknown = np.full(len(acting.segments), np.nan)
         return Evaluation(np.nan, np.nan, nothing, unknown, unknown, thresholds)
-    scores = simulation.score(estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals)
-    error_of = mean_squared_error if estimate.squared_error else rms_error
+    scores = Simulation(acting, judged, estimate.resolution, settings.threads).score(
+        starts, estimate.values[None], scoring.thresholds[judged], scoring.min_inlier_signals
+    )
+
+    def error_of(x: Scores, n_rows: int) -> float:
+        error = mean_squared_error if estimate.squared_error else rms_error
+        return float(error(x.sum_squares, n_rows, scoring.weights[judged])[0])
+
     counts = [one.n_rows for one in acting.segments]
-    parts = list(zip(scores.logs, counts, strict=True))
+    parts = [(scores.of_log(i), n) for i, n in enumerate(counts)]
     return Evaluation(
-        fit_error=float(error_of(scores.sum_squares, acting.n_rows, weights)[0]),
+        fit_error=error_of(scores, acting.n_rows),
         inlier_fraction=float(scores.inlier_count[0] / acting.n_rows),
         inliers=acting.on_given_logs(scores.inlier_masks(0)),
-        fit_errors=np.array([error_of(one.sum_squares, n, weights)[0] for one, n in parts]),
-        inlier_fractions=np.array([one.inlier_count[0] / n for one, n in parts]),
+        fit_errors=np.array([error_of(x, n) for x, n in parts]),
+        inlier_fractions=np.array([x.inlier_count[0] / n for x, n in parts]),
         thresholds=thresholds,
     )
 
 
-def as_estimated(
-    dataset: Dataset, found: Diagnosis | None, settings: Settings
-) -> tuple[Dataset, list[tuple[Stretch, ...]]]:
-    """The dataset with the rows that an estimate simulates, and the simulations of each log.
-
-    Parameters
-    ----------
-    dataset : Dataset
-    found : Diagnosis, optional
-        Outliers and smoothed states; None: simulations start from measured states.
-    settings : Settings
-        Rule of the initial states.
-
-    Returns
-    -------
-    dataset : Dataset
-        The rows that no simulation covers count as gaps.
-    stretches : list of tuple of Stretch
-        With a diagnosis, after a gap: from the first smoothed state.  With ``initial_state="first"``, at the first row:
-        the first sample, replaced by the smoothed state where it is missing or an outlier.
-    """
-    begins = np.cumsum([0, *(len(log) for log in dataset.given)])
-    stretches = []
+def as_estimated(dataset: Dataset, found: Diagnosis | None) -> Dataset:
+    """The dataset, in which rows from a gap to the first smoothed state after it count as those of the gap."""
+    if found is None:
+        return dataset
+    segments = list(dataset.segments)
     for i, one in enumerate(dataset.segments):
-        first, *others = stretches_of(one, settings.initial_state)
-        if found is not None:
-            others = _resumed(one, i, found)
-            if first.rule != "robust":
-                given = first.rule if isinstance(first.rule, Mapping) else {}
-                start = _first_state(one, i, int(begins[i]) + one.offset, found)
-                first = Stretch(first.rows, {**start, **given})
-        stretches.append((first, *others))
-    segments = tuple(_covered(one, own) for one, own in zip(dataset.segments, stretches, strict=True))
-    return replace(dataset, segments=segments), stretches
+        gaps, (rows, _) = one.gaps.copy(), _smoothed(one, i, found)
+        for x in runs(~one.gaps)[1:]:
+            after = rows[(rows >= x.start) & (rows < x.stop)]
+            gaps[x.start : int(after[0]) if len(after) else x.stop] = True
+        segments[i] = replace(one, gaps=gaps, valid=one.valid & ~gaps)
+    return replace(dataset, segments=tuple(segments))
 
 
-def _resumed(one: Segment, log: int, found: Diagnosis) -> list[Stretch]:
-    """Simulations after each gap of a log, from the first smoothed state there."""
+def _starts(one: Segment, log: int, row: int, found: Diagnosis | None, rule: str | Mapping[str, float]) -> list[Start]:
+    """Simulations of a log as an estimate has it: after a gap, with a diagnosis, from the first smoothed state.
+
+    At the first row, which is ``row`` of all logs, a smoothed state is in place of a sample that is missing or an
+    outlier.
+    """
+    if found is None:
+        return starts_of(one, rule)
+    rows, smoothed = _smoothed(one, log, found)
+    parts = runs(~one.gaps)
+    states = [{n: float(x[k]) for n, x in smoothed.items()} for k in np.searchsorted(rows, [x.start for x in parts])]
+    for name in set(states[0]) & set(one.present) & set(found.outliers):
+        if np.isfinite(one.column(name)[0]) and not found.outliers[name][row]:
+            states[0][name] = float(one.column(name)[0])
+    first = states[0] | (dict(rule) if isinstance(rule, Mapping) else {})
+    rules = [rule if rule == "robust" else first, *states[1:]]
+    return [(x, one.part(x).initial_state(y)) for x, y in zip(parts, rules, strict=True)]
+
+
+def _smoothed(one: Segment, log: int, found: Diagnosis) -> tuple[IntArray, dict[str, FloatArray]]:
+    """Rows of a log that have a smoothed state, and these."""
     windows = found.windows_of(log)
-    at = np.round((found.smoothed_time[windows] - one.log.time[one.offset]) / one.log.dt).astype(int)
-    stretches = []
-    for rows in runs(~one.gaps)[1:]:
-        inside = np.flatnonzero((at >= rows.start) & (at < rows.stop))
-        if len(inside):
-            state = {name: float(x[windows[inside[0]]]) for name, x in found.smoothed_states.items()}
-            stretches.append(Stretch(slice(int(at[inside[0]]), rows.stop), state))
-    return stretches
-
-
-def _covered(one: Segment, stretches: tuple[Stretch, ...]) -> Segment:
-    """The segment, in which the rows of no stretch are those of a gap."""
-    gaps = np.ones(len(one), bool)
-    for x in stretches:
-        gaps[x.rows] = False
-    return one if np.array_equal(gaps, one.gaps) else replace(one, gaps=gaps, valid=one.valid & ~gaps)
-
-
-def _first_state(one: Segment, log: int, row: int, found: Diagnosis) -> dict[str, float]:
-    """Values of the first row, which is ``row`` of all logs; smoothed ones for what is missing or an outlier."""
-    start = found.first_states(log)
-    for name in start:
-        if name in found.outliers and name in one.present and not found.outliers[name][row]:
-            first = float(one.column(name)[0])
-            start[name] = first if np.isfinite(first) else start[name]
-    return start
+    rows = np.round((found.smoothed_time[windows] - one.log.time[one.offset]) / one.log.dt).astype(int)
+    return rows, {n: x[windows] for n, x in found.smoothed_states.items()}
 
 
 # ---------------------------------------------------------------------- errors

@@ -14,6 +14,9 @@ from diransac.data.segment import Segment
 from diransac.identification.diagnosis import Resolution
 from diransac.simulation import Measurements, RolloutBatch, ScoreBatch, Simulator, default_threads, rollouts
 
+Start = tuple[slice, FloatArray]
+"""Rows of a log that one simulation covers, without a gap, and the state ``(n_x,)`` at the first."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scores:
@@ -21,125 +24,54 @@ class Scores:
 
     Parameters
     ----------
-    sum_squares : (n_lanes, n_s) array
-        Squared errors summed over the rows that count, each signal's unit squared; infinite where a rollout diverged.
-    inlier_count : (n_lanes,) int array
-        Number of inliers.
-    logs : tuple of LogScores
-        Scores of each log.
+    n_rows : tuple of int
+        Rows of each log.
+    simulations : sequence of (int, slice, ScoreBatch)
+        Index of the log, rows and scores of each simulation.
     """
 
-    sum_squares: FloatArray
-    inlier_count: IntArray
-    logs: tuple[LogScores, ...]
+    n_rows: tuple[int, ...]
+    simulations: Sequence[tuple[int, slice, ScoreBatch]]
+
+    @cached_property
+    def sum_squares(self) -> FloatArray:
+        """Squared errors ``(n_lanes, n_s)`` over the rows that count; infinite where a rollout diverged."""
+        return np.asarray(np.sum([x.sum_squares for _, _, x in self.simulations], axis=0))
+
+    @cached_property
+    def inlier_count(self) -> IntArray:
+        """Number of inliers ``(n_lanes,)``."""
+        return np.asarray(np.sum([x.inlier_count for _, _, x in self.simulations], axis=0))
+
+    def of_log(self, i: int) -> Scores:
+        """The scores of one log."""
+        return replace(self, simulations=[x for x in self.simulations if x[0] == i])
 
     def inlier_masks(self, lane: int) -> list[BoolArray]:
         """Inliers ``(N,)`` of one hypothesis over all rows of each log; False in rows that do not count."""
-        return [one.inliers(lane) for one in self.logs]
+        masks = [np.zeros(n, bool) for n in self.n_rows]
+        for log, rows, scores in self.simulations:
+            masks[log][rows] = scores.inliers(lane)
+        return masks
 
 
-@dataclass(frozen=True)
-class LogScores:
-    """Agreement of hypotheses with one log.
+def starts_of(one: Segment, rule: str | Mapping[str, float]) -> list[Start]:
+    """Simulations of a log between its gaps, whose initial states follow a rule of ``Settings.initial_state``.
 
-    Parameters
-    ----------
-    n_rows : int
-        Number of rows of the log.
-    stretches : tuple of (slice, ScoreBatch)
-        Rows of each simulation, and its scores.
+    After a gap, where given values do not hold, the rule is "robust" in their place.
+
+    Raises
+    ------
+    LogError
+        The log lacks a state on which a measured signal depends.
     """
-
-    n_rows: int
-    stretches: tuple[tuple[slice, ScoreBatch], ...]
-
-    @property
-    def sum_squares(self) -> FloatArray:
-        """Squared errors summed over the rows that count, (n_lanes, n_s)."""
-        first, *others = (batch.sum_squares for _, batch in self.stretches)
-        return sum(others, first)
-
-    @property
-    def inlier_count(self) -> IntArray:
-        """Number of inliers, (n_lanes,)."""
-        first, *others = (batch.inlier_count for _, batch in self.stretches)
-        return sum(others, first)
-
-    def inliers(self, lane: int) -> BoolArray:
-        """Inliers ``(n_rows,)`` of one hypothesis."""
-        found = np.zeros(self.n_rows, bool)
-        for rows, batch in self.stretches:
-            found[rows] = batch.inliers(lane)
-        return found
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Rows of a log that one simulation covers.
-
-    Parameters
-    ----------
-    rows : slice
-        Rows without a gap.
-    rule : str or mapping of str to float
-        Rule of the initial state, as ``Settings.initial_state``.
-    """
-
-    rows: slice
-    rule: str | Mapping[str, float]
-
-
-def stretches_of(one: Segment, rule: str | Mapping[str, float]) -> tuple[Stretch, ...]:
-    """Stretches of a log between its gaps.
-
-    Parameters
-    ----------
-    one : Segment
-    rule : str or mapping of str to float
-        Of the first row.  After a gap, where given values do not hold, it is "robust" in their place.
-
-    Returns
-    -------
-    tuple of Stretch
-    """
-    first, *others = one.stretches
     later = rule if isinstance(rule, str) else "robust"
-    return (Stretch(first, rule), *(Stretch(rows, later) for rows in others))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class _Run:
-    """Data of the simulation of a stretch: all but its parameters.
-
-    Parameters
-    ----------
-    rows : slice
-        Rows of the log.
-    state : (n_x,) array
-        State at the first row.
-    inputs : (N, n_u) array
-    measured : Measurements
-    is_complete : bool
-        True if no signal is missing in a row that counts.
-    """
-
-    rows: slice
-    state: FloatArray
-    inputs: FloatArray
-    measured: Measurements
-    is_complete: bool
-
-    @classmethod
-    def of(cls, rows: slice, state: FloatArray, inputs: FloatArray, measured: Measurements) -> _Run:
-        """Run over some rows of a log."""
-        own = Measurements(measured.values[rows], measured.valid[rows])
-        return cls(rows, state, inputs[rows], own, not np.isnan(own.values[own.valid]).any())
+    rules = [rule, *(later for _ in one.stretches[1:])]
+    return [(rows, one.part(rows).initial_state(x)) for rows, x in zip(one.stretches, rules, strict=True)]
 
 
 class Simulation:
     """Simulations of the logs of a dataset, driven by their inputs.
-
-    No simulation passes through a gap: it ends there, and another one begins after it.
 
     Parameters
     ----------
@@ -148,8 +80,6 @@ class Simulation:
         Signals of the dataset that are compared with the measured ones; None: all.
     resolution : Resolution, optional
         Integrator, steps per sample, hold and timing of the inputs.
-    stretches : sequence of tuple of Stretch, optional
-        Simulations of each log in `score`; None: from the first samples, and those after each gap.
     threads : int, optional
         Number of threads; None: one per core.
     """
@@ -159,74 +89,53 @@ class Simulation:
         dataset: Dataset,
         signals: BoolArray | None = None,
         resolution: Resolution | None = None,
-        stretches: Sequence[tuple[Stretch, ...]] | None = None,
         threads: int | None = None,
     ) -> None:
         compared = np.ones(len(dataset.signals), bool) if signals is None else signals
         resolution = resolution or Resolution()
         names = [n for n, j in zip(dataset.signals, compared, strict=True) if j]
-        self._segments, self._layout = dataset.segments, dataset.layout
-        self._stretches = [stretches_of(one, "first") for one in dataset.segments] if stretches is None else stretches
+        self.segments, self._layout = dataset.segments, dataset.layout
         self._threads = threads or default_threads()
         self._simulator: Simulator = rollouts(
             dataset.model, names, integrator=resolution.integrator, substeps=resolution.substeps, hold=resolution.hold
         )
-        self._measured = [
-            Measurements(np.ascontiguousarray(one.measured[:, compared]), one.valid) for one in dataset.segments
-        ]
+        self._measured = [np.ascontiguousarray(one.measured[:, compared]) for one in dataset.segments]
         self._inputs = [resolution.timing.acting(one.inputs, one.log.dt, resolution.hold) for one in dataset.segments]
 
-    @cached_property
-    def starts(self) -> list[list[tuple[slice, FloatArray]]]:
-        """Rows of each simulation of each log, and its initial state ``(n_x,)``.
-
-        Raises
-        ------
-        LogError
-            A log lacks a state on which a measured signal depends.
-        """
-        pairs = zip(self._segments, self._stretches, strict=True)
-        return [[(x.rows, one.part(x.rows).initial_state(x.rule)) for x in stretches] for one, stretches in pairs]
-
-    def score(self, parameters: FloatArray, thresholds: FloatArray, min_inlier_signals: int) -> Scores:
+    def score(
+        self,
+        starts: Sequence[Sequence[Start]],
+        parameters: FloatArray,
+        thresholds: FloatArray,
+        min_inlier_signals: int,
+    ) -> Scores:
         """Sums of squared errors and inliers of every hypothesis over all logs.
 
         Parameters
         ----------
+        starts : sequence of sequence of Start
+            Simulations of each log.
         parameters : (n_lanes, n) array
             Hypotheses, each parameter in its unit.
         thresholds : (n_s,) array
             Inlier thresholds of the compared signals.
         min_inlier_signals : int
             Number of signals of a row that must be below their thresholds.
-
-        Returns
-        -------
-        Scores
         """
-        logs = []
-        for i, (one, runs_of_log) in enumerate(zip(self._segments, self._runs, strict=True)):
-            own, found = self._layout.of_log(parameters, i), []
-            for run in runs_of_log:
-                lanes = RolloutBatch(own, run.state, run.inputs, one.log.dt)
-                found.append((run.rows, self._score(lanes, run, thresholds, min_inlier_signals)))
-            logs.append(LogScores(len(one), tuple(found)))
-        sums, counts = logs[0].sum_squares, logs[0].inlier_count
-        for other in logs[1:]:
-            sums, counts = sums + other.sum_squares, counts + other.inlier_count
-        return Scores(sums, counts, tuple(logs))
-
-    @cached_property
-    def _runs(self) -> list[list[_Run]]:
-        """Simulations of each log; see `starts`."""
-        parts = zip(self.starts, self._inputs, self._measured, strict=True)
-        return [[_Run.of(*start, inputs, measured) for start in starts] for starts, inputs, measured in parts]
-
-    def _score(self, lanes: RolloutBatch, run: _Run, thresholds: FloatArray, min_inlier_signals: int) -> ScoreBatch:
-        """Scores of a stretch."""
-        if not run.is_complete:
-            return _incomplete_scores(self._simulator, lanes, run.measured, thresholds, min_inlier_signals)
-        return self._simulator.score(lanes, run.measured, thresholds, min_inlier_signals, threads=self._threads)
+        simulations = []
+        for i, (one, values) in enumerate(zip(self.segments, self._measured, strict=True)):
+            own = self._layout.of_log(parameters, i)
+            for rows, state in starts[i]:
+                lanes = RolloutBatch(own, state, self._inputs[i][rows], one.log.dt)
+                measured = Measurements(values[rows], one.valid[rows])
+                if np.isnan(measured.values[measured.valid]).any():
+                    scores = _incomplete_scores(self._simulator, lanes, measured, thresholds, min_inlier_signals)
+                else:
+                    scores = self._simulator.score(
+                        lanes, measured, thresholds, min_inlier_signals, threads=self._threads
+                    )
+                simulations.append((i, rows, scores))
+        return Scores(tuple(map(len, self.segments)), simulations)
 
     def errors(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
@@ -251,24 +160,23 @@ class Simulation:
         (K, n_rows, n_s) array
             NaN from a divergence on; a missing sample counts as measured 0.
         """
-        batch, measured = self._restarted(log, parameters, states, start_rows, n_rows)
-        return self._simulator.errors(batch, measured)
+        batch = self._restarted(log, parameters, states, start_rows, n_rows)
+        measured = np.nan_to_num(self._measured[log])
+        measured = np.pad(measured, ((0, len(batch.inputs) - len(measured)), (0, 0)), mode="edge")
+        return self._simulator.errors(batch, Measurements(measured, np.ones(len(measured), bool)))
 
     def trajectories(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
     ) -> FloatArray:
         """All signals of the model ``(K, n_rows, n_signals)``; parameters as those of `errors`."""
-        return self._simulator.trajectories(self._restarted(log, parameters, states, start_rows, n_rows)[0])
+        return self._simulator.trajectories(self._restarted(log, parameters, states, start_rows, n_rows))
 
     def _restarted(
         self, log: int, parameters: FloatArray, states: FloatArray, start_rows: IntArray, n_rows: int
-    ) -> tuple[RolloutBatch, Measurements]:
-        one, measured = self._segments[log], np.nan_to_num(self._measured[log].values)
-        more = ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0))
-        inputs, measured = (np.pad(x, more, mode="edge") for x in (self._inputs[log], measured))
-        lanes = np.tile(parameters, (len(states), 1))
-        batch = RolloutBatch(lanes, states, inputs, one.log.dt, start_rows, n_rows)
-        return batch, Measurements(measured, np.ones(len(measured), bool))
+    ) -> RolloutBatch:
+        one, inputs = self.segments[log], self._inputs[log]
+        inputs = np.pad(inputs, ((0, max(0, int(start_rows.max()) + n_rows - len(one))), (0, 0)), mode="edge")
+        return RolloutBatch(np.tile(parameters, (len(states), 1)), states, inputs, one.log.dt, start_rows, n_rows)
 
 
 def _incomplete_scores(
@@ -281,12 +189,10 @@ def _incomplete_scores(
     """
     known = np.isfinite(measured.values) & measured.valid[:, None]
     errors = simulator.errors(lanes, replace(measured, values=np.nan_to_num(measured.values)))
-    weight = measured.valid.sum() / np.maximum(known.sum(axis=0), 1)
-    squares = np.where(known, np.square(np.nan_to_num(errors, nan=np.inf)), 0.0).sum(axis=1) * weight
+    sizes = np.where(known, np.abs(np.nan_to_num(errors, nan=np.inf)), 0.0)
+    squares = np.square(sizes).sum(axis=1) * measured.valid.sum() / np.maximum(known.sum(axis=0), 1)
     judged = thresholds > 0.0
     needed = np.ceil(min_inlier_signals * (known & judged).sum(axis=1) / max(1, judged.sum()))
-    near = (known & (np.abs(np.nan_to_num(errors, nan=np.inf)) < thresholds)).sum(axis=2)
-    inliers = (near >= np.maximum(needed, 1.0)) & measured.valid
-    diverged = ~np.isfinite(squares).all(axis=1)
+    inliers = ((known & (sizes < thresholds)).sum(axis=2) >= np.maximum(needed, 1.0)) & measured.valid
     bits = np.packbits(inliers, axis=0, bitorder="little")
-    return ScoreBatch(lanes, squares, inliers.sum(axis=1), diverged, bits)
+    return ScoreBatch(lanes, squares, inliers.sum(axis=1), ~np.isfinite(squares).all(axis=1), bits)

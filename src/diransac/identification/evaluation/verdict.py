@@ -13,9 +13,6 @@ from diransac.identification.estimate import TELLING, Disagreement, Predictions
 from diransac.identification.finding import FAR, NEAR, Finding, Level, graded
 from diransac.text_table import listed, number, percent
 
-_NOTICED = 1e-3
-"""Change of predictions over the motion, up to which nobody would notice that parameters are others."""
-
 
 def findings_of_predictions(found: Predictions, action: str) -> Iterator[Finding]:
     """Findings on the predictions of the worst state and of the worst sensor over the judged horizon.
@@ -65,7 +62,8 @@ def level_of_disagreement(found: Disagreement, moved: float, width: float) -> Le
         return "bad"
     if found.effect > NEAR or moved > width:
         return "care"
-    return "note" if found.effect > _NOTICED else None
+    # Nobody notices a change of predictions by a thousandth of the motion.
+    return "note" if found.effect > 1e-3 else None
 
 
 def _worst_state(errors: Mapping[str, float], over: str, action: str) -> Iterator[Finding]:

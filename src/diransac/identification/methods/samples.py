@@ -13,7 +13,7 @@ from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.evaluation.scoring import Scoring, mean_squared_error, rms_error
-from diransac.identification.evaluation.simulation import Scores, Simulation, stretches_of
+from diransac.identification.evaluation.simulation import Scores, Simulation, starts_of
 from diransac.simulation.compiler.machine_code import LANES
 
 if TYPE_CHECKING:
@@ -93,9 +93,8 @@ class Evaluator:
         self._min_inlier_signals = scoring.min_inlier_signals
         self._valid = [one.valid for one in dataset.segments]
         resolution = Resolution(settings.integrator, settings.substeps, dataset.hold)
-        stretches = [stretches_of(one, settings.initial_state) for one in dataset.segments]
-        self._simulation = Simulation(dataset, judged, resolution, stretches, settings.threads)
-        self._simulation.starts  # noqa: B018  refuses a log without an initial state
+        self._starts = [starts_of(one, settings.initial_state) for one in dataset.segments]
+        self._simulation = Simulation(dataset, judged, resolution, settings.threads)
 
     def admits(self, parameters: FloatArray) -> BoolArray:
         """Preliminary test of ``(n_vectors, n)`` parameters: every one within its bounds."""
@@ -103,7 +102,7 @@ class Evaluator:
 
     def score(self, parameters: FloatArray) -> ScoredBatch:
         """Error, inlier fraction and inliers of every hypothesis ``(n_vectors, n)``."""
-        scores = self._simulation.score(parameters, self._thresholds, self._min_inlier_signals)
+        scores = self._simulation.score(self._starts, parameters, self._thresholds, self._min_inlier_signals)
         return ScoredBatch(scores, self._weights, self._valid)
 
 

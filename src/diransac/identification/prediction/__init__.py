@@ -2,7 +2,8 @@
 
 | file | contents |
 |---|---|
-| `horizons.py` | the horizons that are scored, and the one that is judged |
+| `horizons.py` | scores of the horizons that suit the logs, and the one that is judged |
+| `open_loop.py` | windows of a log, errors of their predictions beside trivial ones, simulations |
 | `starts.py` | initial states of windows, from the samples before them |
-| `open_loop.py` | scores of predictions beside trivial ones |
+| `inverse.py` | forces that the motion needs, beside those of the inputs |
 """

@@ -13,7 +13,6 @@ Gasser, Sroka, Jennen-Steinmetz 1986 (noise by pseudo-residuals); Ljung 1999, "S
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,17 +23,14 @@ from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset
 from diransac.data.segment import Segment
 from diransac.errors import LogError
+from diransac.identification.core.noise import lower_scale
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.method import LoDiransac
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.methods.lo_diransac.without_equations import followed
-
-_FINEST = 1e-6
-"""Noise over the range of a signal, at least: the weights of samples without noise."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,8 +46,6 @@ class SmoothedLog:
         over few samples follows their noise: then about the line between neighbours, which adds its curvature.
     outliers : (N, n_s) bool array
         Samples of the dataset's signals that are far from the motion.
-    samples : (n_s,) array
-        Mean number of each signal's samples over which the motion is smoothed.
     intervals : ShootingIntervals or None
         The log in shooting intervals, of a model with equations.
     """
@@ -59,7 +53,6 @@ class SmoothedLog:
     signals: FloatArray
     noise: FloatArray
     outliers: BoolArray
-    samples: FloatArray
     intervals: ShootingIntervals | None = None
 
 
@@ -89,7 +82,7 @@ def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
     least = 1e-3 * motion.spread[columns]
     # Outliers are six standard deviations of the noise from the motion.
     outliers = known & (np.abs(np.where(known, distances, 0.0)) > 6.0 * np.maximum(noise, least))
-    return SmoothedLog(signals, noise, outliers, samples, intervals)
+    return SmoothedLog(signals, noise, outliers, intervals)
 
 
 def followed_log(dataset: Dataset, parameters: FloatArray, resolution: Resolution) -> SmoothedLog | None:
@@ -111,9 +104,7 @@ def followed_log(dataset: Dataset, parameters: FloatArray, resolution: Resolutio
     columns = [model.signals.index(n) for n in one.signals]
     signals = found.signals[: len(one)].copy()
     signals[one.gaps] = np.nan
-    samples = np.isfinite(one.measured).mean(axis=0) * found.length
-    outliers = found.outliers[: len(one), columns]
-    return SmoothedLog(signals, found.noise[columns], outliers, samples)
+    return SmoothedLog(signals, found.noise[columns], found.outliers[: len(one), columns])
 
 
 def _of_pseudo_residuals(samples: FloatArray) -> FloatArray:
@@ -144,13 +135,15 @@ class StartEstimator:
     parameters : (n_p,) array
     states : (N, n_x) array
         States at every row, without the model: means of a prior, whose standard deviations are their spread.
-    noise : (n_signals,) array
-        Standard deviation of each signal of the model, its unit; infinite for one that the log lacks.
-    finest : (n_signals,) array
+    columns : (n_s,) int array
+        Places of the segment's signals among the model's.
+    finest : (n_s,) array
         Least standard deviation of each signal: that of one without noise.
-    scale : (n_signals,) array
+    noise : (n_s,) array
+        Standard deviation of each signal, its unit.
+    scale : (n_s,) array
         By which samples are weighted: of what the model leaves of each signal.
-    outliers : (N, n_signals) bool array
+    outliers : (N, n_s) bool array
         Samples that do not count.
     n_before : int
         Rows before a state whose samples determine it.
@@ -160,8 +153,9 @@ class StartEstimator:
     acting: ActingInputs
     parameters: FloatArray
     states: FloatArray
-    noise: FloatArray
+    columns: IntArray
     finest: FloatArray
+    noise: FloatArray
     scale: FloatArray
     outliers: BoolArray
     n_before: int
@@ -187,15 +181,14 @@ class StartEstimator:
         intervals = replace(smoothed.intervals, substeps=resolution.substeps)
         acting = resolution.timing.acting(segment.inputs, segment.log.dt, resolution.hold)
         values = np.pad(acting, ((0, len(intervals.measured) - len(acting)), (0, 0)), mode="edge")
-        columns = [intervals.model.signals.index(n) for n in segment.signals]
-        noise, outliers = np.full((2, len(intervals.model.signals)), np.inf), np.zeros(intervals.sampled.shape, bool)
-        noise[1, columns] = _FINEST * _width_of_bulk(segment.measured)
-        noise[0, columns] = np.maximum(smoothed.noise, noise[1, columns])
-        outliers[: len(segment), columns] = smoothed.outliers
+        columns = np.array([intervals.model.signals.index(n) for n in segment.signals])
+        # Samples without noise have the weight of noise of a millionth of their range.
+        finest = 1e-6 * _width_of_bulk(segment.measured)
+        noise = np.maximum(smoothed.noise, finest)
         longest = max((x.stop - x.start for x in runs(~segment.gaps)), default=0)
         n_before = max(1, min(intervals.length, longest // 2))
         inputs = ActingInputs(values, resolution.hold, resolution.timing)
-        return cls(intervals, inputs, parameters, states, noise[0], noise[1], noise[0], outliers, n_before)
+        return cls(intervals, inputs, parameters, states, columns, finest, noise, noise, smoothed.outliers, n_before)
 
     def shorter(self) -> list[StartEstimator]:
         """The same, and those that use a half and a quarter of the rows, of five samples at least."""
@@ -203,15 +196,11 @@ class StartEstimator:
         rows = {n for n in (self.n_before, self.n_before // 2, self.n_before // 4) if n >= min(fewest, self.n_before)}
         return [replace(self, n_before=n) for n in sorted(rows, reverse=True)]
 
-    def refined(
-        self, columns: Sequence[int], noise: FloatArray, scale: FloatArray, outliers: BoolArray
-    ) -> StartEstimator:
-        """The same with other noise and scales ``(n,)``, and outliers ``(N, n)``, of some signals."""
-        some, every, found = self.noise.copy(), self.scale.copy(), self.outliers.copy()
-        some[columns] = np.maximum(noise, self.finest[columns])
-        every[columns] = np.where(np.isfinite(scale), np.maximum(scale, some[columns]), every[columns])
-        found[: len(outliers), columns] = outliers
-        return replace(self, noise=some, scale=every, outliers=found)
+    def refined(self, noise: FloatArray, scale: FloatArray, outliers: BoolArray) -> StartEstimator:
+        """The same with other noise, scales, where they are finite, and outliers."""
+        noise = np.maximum(noise, self.finest)
+        scale = np.where(np.isfinite(scale), np.maximum(scale, noise), self.scale)
+        return replace(self, noise=noise, scale=scale, outliers=outliers)
 
     def at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """States at some rows, and how uncertain they are.
@@ -228,46 +217,61 @@ class StartEstimator:
         (K, n_x, n_x) array
             Independent errors of each state, of one standard deviation, a row each.
         """
-        segments, begin = self._segments(rows), self._begin(rows)
-        K, n_x = begin.shape
-        lanes = np.tile(self.parameters, (K, 1))
-        found = segments.gauss_newton(lanes, begin, self._weights(segments, self.noise), np.arange(K))
-        information = found.normal_matrix * np.outer(self._spread, self._spread) + np.eye(n_x)
+        segments, lanes = self._segments(rows - self.n_before), np.tile(self.parameters, (len(rows), 1))
+        found = segments.gauss_newton(
+            lanes, self._fitted(segments), self._weights(segments, self.noise), np.arange(len(rows))
+        )
+        information = found.normal_matrix * np.outer(self._spread, self._spread) + np.eye(len(self._spread))
         values, vectors = np.linalg.eigh(information)
         roots = (vectors / np.sqrt(np.maximum(values, 1.0))[:, None, :]).swapaxes(1, 2) * self._spread
         finite: BoolArray = np.asarray(np.isfinite(found.final_states).all(axis=1))
         states = np.where(finite[:, None], found.final_states, self.states[rows])
         return states, roots @ np.nan_to_num(found.final_slopes).swapaxes(1, 2)
 
+    def drawn(self, rows: IntArray, firsts: IntArray) -> FloatArray:
+        """States ``(K, n_x)`` at any rows, of simulations that follow the rows before, or the first ones of a stretch.
+
+        Parameters
+        ----------
+        rows : (K,) int array
+        firsts : (K,) int array
+            First row of the stretch of each, which has ``n_before`` rows at least.
+        """
+        begins = np.maximum(rows - self.n_before, firsts)
+        segments, lanes = self._segments(begins), np.tile(self.parameters, (1, len(rows), 1))
+        longer = replace(segments, n_rows=self.n_before + 1)
+        series = longer.trajectories(lanes, self._fitted(segments)[None])[0]
+        states = series[np.arange(len(rows)), rows - begins, : self.states.shape[1]]
+        return np.where(np.isfinite(states).all(axis=1, keepdims=True), states, self.states[rows])
+
     def errors(self, rows: IntArray, *, fitted: bool) -> FloatArray:
-        """Simulated less measured signals ``(K, n_before, n_signals)`` before some rows; NaN where unknown.
+        """Simulated less measured signals ``(K, n_before, n_s)`` before some rows; NaN where unknown.
 
         Simulations are fitted to the samples, or start from the states without the model.
         """
-        segments = self._segments(rows)
-        found = np.full((len(rows), segments.n_rows, len(self.noise)), np.nan)
-        begin = self._begin(rows) if fitted else self.states[segments.starts]
-        errors = segments.errors(np.tile(self.parameters, (1, len(rows), 1)), begin[None])[0]
+        segments = self._segments(rows - self.n_before)
+        found = np.full((len(rows), segments.n_rows, len(self.intervals.model.signals)), np.nan)
+        states = self._fitted(segments) if fitted else self.states[segments.starts]
+        errors = segments.errors(np.tile(self.parameters, (1, len(rows), 1)), states[None])[0]
         found[:, :, segments.columns] = np.where(segments.known, errors, np.nan)
-        return found
+        return found[:, :, self.columns]
 
-    def _segments(self, rows: IntArray) -> Segments:
-        """Segments that end before some rows."""
-        return Segments(self.intervals, self.acting, rows - self.n_before, self.n_before)
+    def _segments(self, begins: IntArray) -> Segments:
+        """Segments of ``n_before`` rows."""
+        return Segments(self.intervals, self.acting, begins, self.n_before)
 
-    def _begin(self, rows: IntArray) -> FloatArray:
-        """States ``(K, n_x)`` at the first row of each segment."""
-        segments = self._segments(rows)
-        first, lanes = self.states[segments.starts][None], np.tile(self.parameters, (1, len(rows), 1))
+    def _fitted(self, segments: Segments) -> FloatArray:
+        """States ``(K, n_x)`` at the first row of each segment by the samples in it."""
+        first, lanes = self.states[segments.starts][None], np.tile(self.parameters, (1, len(segments), 1))
         weights = self._weights(segments, self.scale)
         found: FloatArray = segments.estimated_states(lanes, first, self._spread, weights)[0]
         return found
 
     def _weights(self, segments: Segments, scale: FloatArray) -> FloatArray:
-        """Weights ``(N, n_s)`` of the compared signals in all rows."""
-        counted = self.intervals.sampled & ~self.outliers
-        found: FloatArray = counted[:, segments.columns] / np.square(scale[segments.columns])
-        return found
+        """Weights of the compared signals in all rows, of scales ``(n_s,)``."""
+        weights = np.zeros(self.intervals.sampled.shape)
+        weights[: len(self.outliers), self.columns] = ~self.outliers / np.square(scale)
+        return np.where(self.intervals.sampled, weights, 0.0)[:, segments.columns]
 
     @cached_property
     def _spread(self) -> FloatArray:

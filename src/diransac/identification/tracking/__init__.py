@@ -7,10 +7,9 @@
 | `stream.py` | samples on the grid of their clock; gaps, restarts, late and repeated ones; sensors that stop |
 | `starting.py` | the problem, the first window, and a start by the default method |
 | `window.py` | the fit of the last intervals, and what remains of those before |
-| `changes.py` | steps and drifts of parameters: tested, compared, released, reported |
-| `step_tests.py`, `forces.py` | their tests; larger unmodelled forces |
-| `search.py`, `stepped_fits.py` | fits of a window with a step, and with larger forces instead |
-| `surprise.py` | outliers where a machine may have changed |
+| `fits.py` | fits of some intervals, with larger unmodelled forces; what they leave to the intervals after them |
+| `steps.py` | steps of parameters: their tests, fits with a step, and the search for the best explanation |
+| `changes.py` | steps and drifts of parameters: compared, released, reported |
 """
 
 from diransac.identification.tracking.estimates import Change, TrackedEstimate

@@ -17,8 +17,8 @@ from diransac.text_table import number
 if TYPE_CHECKING:
     from diransac.model import Model
 
-# Estimates that are kept: a figure has fewer cells than a tenth of it.
 _MOST = 20_000
+"""Estimates that are kept: a figure has fewer cells than a tenth of it."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,22 +14,22 @@ from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.data.input_timing import InputTiming
 from diransac.data.log import Log
 from diransac.errors import DiransacError
+from diransac.identification.core.boundary import BoundaryPrior
+from diransac.identification.core.fit import with_residuals
+from diransac.identification.core.minimise import make_prior, refine, start
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.identify import identify
 from diransac.identification.methods.lo_diransac import LoDiransac
-from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
 from diransac.identification.methods.lo_diransac.motion_equations import parameter_units
-from diransac.identification.methods.lo_diransac.normal_equations import with_residuals
 from diransac.identification.methods.lo_diransac.preparation import prepared
-from diransac.identification.methods.lo_diransac.refinement import make_prior, negative_log_evidence, refine, start
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion
-from diransac.identification.tracking.surprise import followed
+from diransac.identification.tracking.fits import followed
 from diransac.identification.tracking.window import AS_LIKELY, Window
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.core.fit import Fit
     from diransac.identification.result import Result
     from diransac.identification.tracking.stream import Stream
     from diransac.model import Model
@@ -60,11 +61,6 @@ class Setup:
     settings: LoDiransacSettings = field(default_factory=LoDiransacSettings)
     exact: bool = False
 
-    @property
-    def n_signals(self) -> int:
-        """Number of the columns of a stream that are signals; the others are inputs."""
-        return len(self.model.signals)
-
     def intervals(self, stream: Stream, first: int, n: int) -> ShootingIntervals:
         """Intervals of a stream.
 
@@ -81,13 +77,11 @@ class Setup:
         ShootingIntervals
         """
         length = stream.length // stream.parts
-        held = stream.values[: first - stream.first + n * length]
+        held, n_s = stream.values[: first - stream.first + n * length], len(self.model.signals)
         rows = slice(first - stream.first, len(held))
-        measured = held[rows, : self.n_signals]
-        known = np.isfinite(measured)
-        missing = np.asarray(np.isnan(held[:, self.n_signals :]).any(axis=1))
-        inputs = interpolated(held[:, self.n_signals :])
-        acting = self.timing.acting(inputs, stream.dt, self.hold)[rows]
+        measured, recorded = held[rows, :n_s], held[:, n_s:]
+        known, missing = np.isfinite(measured), np.asarray(np.isnan(recorded).any(axis=1))
+        acting = self.timing.acting(interpolated(recorded), stream.dt, self.hold)[rows]
         return ShootingIntervals(
             model=self.model,
             layout=self.layout,
@@ -182,15 +176,10 @@ def begun(setup: Setup, stream: Stream, first: int, n: int, given: Start, most: 
     LogError
         The rows are too few, or have too few samples.
     """
-    length = stream.length // stream.parts
-    motion = smoothed_motion(setup, stream, first, n * length)
-    first_hold, *others = given.holds
-    best = _fitted(replace(setup, hold=first_hold), stream, first, n, given, motion)
-    for hold in others:
-        other = _fitted(replace(setup, hold=hold), stream, first, n, given, motion)
-        best = other if other.cost < best.cost - AS_LIKELY else best
-    begun_setup, fit = _with_fewest_steps(setup, best.setup, stream, first, best.fit)
-    return Window(begun_setup, stream, first, fit, motion.spread, most)
+    motion = smoothed_motion(setup, stream, first, n * (stream.length // stream.parts))
+    fits = [_fitted(replace(setup, hold=hold), stream, first, n, given, motion) for hold in given.holds]
+    best, fit, _ = min(fits, key=lambda x: x[2] + AS_LIKELY * (x[0].hold != given.holds[0]))
+    return Window(*_with_fewest_steps(setup, best, stream, first, fit), stream, first, motion.spread, most)
 
 
 def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
@@ -211,57 +200,43 @@ def begun_anew(setup: Setup, window: Window, given: Start) -> tuple[Setup, Fit]:
     Setup, Fit
         With the fewest integration steps that are enough.
     """
-    none, shared = np.zeros_like(window.least), window.fit.shared if window.is_exact else given.parameters
+    shared = window.fit.shared if window.is_exact else given.parameters
     alone = replace(window.fit, boundary=window.beginning)
-    best, found, least = window.setup, window.fit, _settled(window.intervals(), alone)[1] - AS_LIKELY
-    for hold in given.holds:
-        own = replace(window.setup, hold=hold)
-        fit = replace(alone, shared=shared, tau=window.least, rho=none)
-        fit, cost = _settled(own.intervals(window.stream, window.first, len(window)), fit)
-        if cost < least:
-            best, found, least = own, fit, cost
-    return _with_fewest_steps(setup, best, window.stream, window.first, found)
+    fits = [(_settled(window.setup, window, alone)[1] + AS_LIKELY, window.setup, window.fit)]
+    for other in (replace(window.setup, hold=hold) for hold in given.holds):
+        fit = replace(alone, shared=shared, tau=window.least, rho=np.zeros_like(window.least))
+        fit, evidence = _settled(other, window, fit)
+        fits.append((evidence, other, fit))
+    _, best, fit = max(fits, key=lambda x: x[0])
+    return _with_fewest_steps(setup, best, window.stream, window.first, fit)
 
 
-def _settled(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, float]:
-    """A fit after some steps, and its negative log evidence, nats; infinite where simulations overflow from there."""
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            fit, solved = followed(intervals, with_residuals(intervals, fit))
-    except np.linalg.LinAlgError:
-        return fit, np.inf
-    return fit, negative_log_evidence(intervals, fit, solved.log_det)
+def _settled(setup: Setup, window: Window, fit: Fit) -> tuple[Fit, float]:
+    """A fit of a window after some steps, and its evidence, nats; -inf where simulations overflow from there."""
+    intervals = setup.intervals(window.stream, window.first, len(window))
+    with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
+        return followed(intervals, with_residuals(intervals, fit))
+    return fit, -np.inf
 
 
-def _with_fewest_steps(setup: Setup, own: Setup, stream: Stream, first: int, fit: Fit) -> tuple[Setup, Fit]:
+def _with_fewest_steps(setup: Setup, other: Setup, stream: Stream, first: int, fit: Fit) -> tuple[Setup, Fit]:
     """A problem with the fewest integration steps of one with the most that change no parameter of a fit noticeably."""
-    few, fit = with_fewest_steps(own.intervals(stream, first, len(fit.x)), fit, setup.settings.substeps)
-    return replace(own, settings=replace(setup.settings, substeps=few.substeps)), fit
+    few, fit = with_fewest_steps(other.intervals(stream, first, len(fit.x)), fit, setup.settings.substeps)
+    return replace(other, settings=replace(setup.settings, substeps=few.substeps)), fit
 
 
-class _Begun(NamedTuple):
-    """Fit of the first intervals, and its negative log evidence."""
-
-    setup: Setup
-    fit: Fit
-    cost: float
-
-
-def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, motion: Motion) -> _Begun:
-    """Fit of the first n intervals of a stream from the parameters of a start."""
-    intervals, p = setup.intervals(stream, first, n), given.parameters
-    if given.covariance is None:
+def _fitted(setup: Setup, stream: Stream, first: int, n: int, given: Start, motion: Motion) -> tuple[Setup, Fit, float]:
+    """Fit of the first n intervals of a stream from the parameters of a start, and its negative log evidence, nats."""
+    intervals, p, covariance = setup.intervals(stream, first, n), given.parameters, given.covariance
+    if covariance is None:
         units = size_or_one(parameter_units(intervals, motion, p))
         covariance = np.diag(np.square(np.maximum(np.abs(p), units)))
-    else:
-        covariance = given.covariance
-    std = np.sqrt(np.diag(covariance))
-    names = setup.layout.names
-    priors = {name: (float(x), float(s)) for name, x, s in zip(names, p, std, strict=True)}
-    with_prior = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
-    prior = make_prior(setup.settings, with_prior, motion, np.full(len(p), np.inf))
-    found = refine(setup.settings, with_prior, start(setup.settings, with_prior, motion, p, prior), prior)
-    return _Begun(setup, _with_boundary(found.fit, p, covariance), found.cost)
+    rough = zip(p.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+    priors = dict(zip(setup.layout.names, rough, strict=True))
+    intervals = replace(intervals, layout=ParameterLayout(setup.layout.parameters, 1, priors))
+    prior = make_prior(setup.settings, intervals, motion, np.full(len(p), np.inf))
+    refinement = refine(setup.settings, intervals, start(setup.settings, intervals, motion, p, prior), prior)
+    return setup, _with_boundary(refinement.fit, p, covariance), refinement.cost
 
 
 def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:
@@ -273,8 +248,7 @@ def _with_boundary(fit: Fit, p: FloatArray, covariance: FloatArray) -> Fit:
     places = n + np.flatnonzero(known)
     information[np.ix_(places, places)] = np.linalg.inv(covariance[np.ix_(known, known)])
     point = np.concatenate([fit.x[0], np.zeros_like(fit.d[0]), p])
-    boundary = BoundaryPrior.of_information(point, information, np.zeros(len(point)))
-    none = np.zeros_like(fit.prior)
+    boundary, none = BoundaryPrior.of_information(point, information, np.zeros(len(point))), np.zeros_like(fit.prior)
     return replace(fit, boundary=boundary, prior=none + np.inf, prior_mean=none)
 
 
@@ -348,15 +322,7 @@ class ColdStart:
         names = (*self.setup.model.signals, *self.setup.model.inputs)
         columns = {n: x.copy() for n, x in zip(names, rows.T, strict=True) if np.isfinite(x).any()}
         log = Log.from_arrays(stream.time(first) + stream.dt * np.arange(len(rows)), columns, source="the stream")
-        method = LoDiransac(suggestions=False)
-        if self.background:
-            pool = ThreadPoolExecutor(1, thread_name_prefix="identification")
-            running = pool.submit(identify, self.setup.model, log, method, seed=self.seed)
-            pool.shutdown(wait=False)
-            return running
-        done: Future[Result] = Future()
-        try:
-            done.set_result(identify(self.setup.model, log, method, seed=self.seed))
-        except DiransacError as error:
-            done.set_exception(error)
-        return done
+        pool = ThreadPoolExecutor(1, thread_name_prefix="identification")
+        running = pool.submit(identify, self.setup.model, log, LoDiransac(suggestions=False), seed=self.seed)
+        pool.shutdown(wait=False)
+        return running

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     from diransac.identification.tracking.window import Window
     from diransac.model import Model
 
-# Stamps from which the interval of the grid is measured first.
-_FIRST_STAMPS = 25
-# Rows without a stamp from which on a new stretch may begin: as `data.segment.silent_rows`.
 _FEWEST_SILENT = 8
+"""Rows without a stamp from which on a new stretch may begin: as `data.segment.silent_rows`."""
 
 Row = tuple[float, FloatArray]
 
@@ -77,7 +75,8 @@ class Stream:
     fresh: int = 0
     lag: int = 0
     _origin: float = 0.0
-    _n_rows: int = _FIRST_STAMPS
+    # Stamps from which the interval of the grid is measured first.
+    _n_rows: int = 25
     _early: list[Row] = field(default_factory=list)
     _suspects: list[Row] = field(default_factory=list)
     _notes: list[str] = field(default_factory=list)
@@ -127,7 +126,7 @@ class Stream:
         if len(self._early) > 1000:
             raise LogError(f"the time of the stream stands still at t = {t:.6g} s; give the time of each sample")
         stamps = np.unique([t for t, _ in self._early])
-        if len(stamps) < _FIRST_STAMPS:
+        if len(stamps) < self._n_rows:
             return []
         apart = np.diff(stamps)
         n_rows = np.round(apart / np.median(apart)).clip(1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.tracking.changes import Changes
 from diransac.identification.tracking.estimates import TrackedEstimate
 from diransac.identification.tracking.starting import ColdStart, Setup, Start, begun, begun_anew, smoothed_motion
-from diransac.identification.tracking.step_tests import fine_ages_of
+from diransac.identification.tracking.steps import fine_ages_of
 from diransac.identification.tracking.stream import SensorWatch, Stream
 from diransac.identification.tracking.window import AS_LIKELY
 from diransac.model import Model
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 Samples = Log | Mapping[str, npt.ArrayLike]
 
-# Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother.
 _FIRST = 1.0
+"""Time from the beginning of a stretch to its first interval at least, s: four half-widths of the smoother."""
 
 
 class Tracker:
@@ -126,11 +126,10 @@ class Tracker:
         LogError
             The time is missing or not finite, columns differ in length, or hold no numbers.
         """
-        found = list(self._estimates(*self._columns(samples)))
-        if not found:
+        new = list(self._estimates(*self._columns(samples)))
+        if not new:
             return None
-        changes = tuple(x for one in found for x in one.changes)
-        return replace(found[-1], changes=changes, notes=tuple(x for one in found for x in one.notes))
+        return replace(new[-1], changes=sum((x.changes for x in new), ()), notes=sum((x.notes for x in new), ()))
 
     @property
     def missing(self) -> str:
@@ -183,10 +182,10 @@ class Tracker:
         """Begin a window where a start is known, and rows enough are there."""
         stream = self._stream
         if self._start is None:
-            found = self._cold.sought(stream, end)
-            if found is None:
+            cold = self._cold.sought(stream, end)
+            if cold is None:
                 return
-            self._setup, self._start, note = found
+            self._setup, self._start, note = cold
             self._notes.append(note)
         first = max(stream.first, stream.fresh)
         n = min((end - first) // stream.length, self._steps)
@@ -212,34 +211,34 @@ class Tracker:
 
     def _advanced(self, window: Window, end: int) -> bool:
         """Move the window on by a step where its rows are complete; False where they are not, or its fit fails."""
-        stream, parts = self._stream, self._stream.parts
-        new = stream.fresh >= window.end
-        n = self._joining(end) if new else parts
-        if n is None or end < window.end + n * window.length:
+        stream, states = self._stream, None
+        is_new = stream.fresh >= window.end
+        n_steps = (end - stream.fresh) // stream.length if is_new else 1
+        n = n_steps * stream.parts
+        if end < window.end + n * window.length or (is_new and n_steps * self._step < _FIRST - 1e-9):
             return False
-        try:
-            states = self._states(window, n) if new else None
-        except DiransacError:  # too few samples as yet
-            return False
+        if is_new:
+            try:
+                motion = smoothed_motion(self._setup, stream, window.end, n * window.length)
+            except DiransacError:  # too few samples as yet
+                return False
+            states = motion.signals[:: window.length, : window.fit.x.shape[1]]
         excess = len(window) + n - window.most
         if excess > 0:
             window.leave(min(excess, len(window) - 1))
             stream.drop(window.first // stream.length * stream.length - stream.first)
         self._changes.before_step(window)
         try:
-            if states is not None:
-                window.join(states)
-            else:
-                window.extend(n)
-            found = window.optimise()
+            window.extend(n, states)
+            equations = window.optimise()
             self._n_updates += 1
             # While the window fills, and whenever all intervals are others, unless forces are remembered.
             is_due = not self._n_updates % self._steps and window.memory.freedom < AS_LIKELY
             is_due = is_due if window.memory.count else len(window) in fine_ages_of(window.most)
             if is_due and self._start is not None and not self._changes.is_suspected:
                 window.setup, window.fit = begun_anew(self._setup, window, self._start)
-                found = window.optimise()
-            self._changes.after_step(window, found)
+                equations = window.optimise()
+            self._changes.after_step(window, equations)
         except np.linalg.LinAlgError:
             self._begin_anew()
         else:
@@ -247,22 +246,11 @@ class Tracker:
                 self._begin_anew()
         return self._window is not None
 
-    def _joining(self, end: int) -> int | None:
-        """Number of the first intervals of a new stretch; None where there are too few rows."""
-        n = (end - self._stream.fresh) // self._stream.length
-        return n * self._stream.parts if n * self._step >= _FIRST - 1e-9 else None
-
-    def _states(self, window: Window, n: int) -> FloatArray:
-        """States with which the first n intervals of a new stretch begin."""
-        n_x = window.fit.x.shape[1]
-        motion = smoothed_motion(self._setup, self._stream, window.end, n * window.length)
-        return motion.signals[:: window.length, :n_x]
-
     def _estimate(self, window: Window) -> TrackedEstimate:
         """Estimate at the end of the window."""
         model, fit = self._setup.model, window.fit
         covariance = self._changes.covariance(window)
-        seen = np.flatnonzero(window.last.intervals.known.any(axis=0)) if window.last else ()
+        seen = np.flatnonzero(window.last.at.intervals.known.any(axis=0)) if window.last else ()
         signals = [(model.signals[k], int(k)) for k in seen]
         notes, self._notes = [*self._notes, *self._sensors.notes(self._stream, window)], []
         names = tuple(model.parameters)
@@ -279,26 +267,15 @@ class Tracker:
         )
 
 
-def track(
-    model: Model,
-    log: Log,
-    *,
-    window: float = 5.0,
-    step: float = 0.1,
-    start: Mapping[str, float] | Result | None = None,
-    seed: int = 0,
-    false_alarms_per_hour: float = 0.1,
-    fixed: Mapping[str, float | None] | Iterable[str] | None = None,
-    drift: Mapping[str, float] | None = None,
-) -> Iterator[TrackedEstimate]:
+def track(model: Model, log: Log, **options: Any) -> Iterator[TrackedEstimate]:
     """Estimates of a `Tracker` over a recorded log, one a step.
 
     Parameters
     ----------
     model : Model
     log : Log
-    window, step, start, seed, false_alarms_per_hour, fixed, drift : optional
-        As those of `Tracker`.
+    **options : optional
+        ``window``, ``step``, ``start``, ``seed``, ``false_alarms_per_hour``, ``fixed`` and ``drift``, as of `Tracker`.
 
     Returns
     -------
@@ -313,17 +290,7 @@ def track(
     """
     if not isinstance(log, Log):
         raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
-    tracker = Tracker(
-        model,
-        window=window,
-        step=step,
-        start=start,
-        seed=seed,
-        false_alarms_per_hour=false_alarms_per_hour,
-        fixed=fixed,
-        drift=drift,
-        background=False,
-    )
+    tracker = Tracker(model, background=False, **options)
     return refused_if_none(tracker, tracker._estimates(*tracker._columns(log)))
 
 

@@ -9,34 +9,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, size_or_one
-from diransac.identification.methods.lo_diransac.boundary import BoundaryPrior
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
-from diransac.identification.methods.lo_diransac.joint_equations import linearized
-from diransac.identification.methods.lo_diransac.mixture import NoiseSums
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations, with_residuals
-from diransac.identification.methods.lo_diransac.scales import (
-    SHRINK,
-    ProcessSums,
-    negligible_jumps,
-    process_sums,
-    unbroken_jumps,
-)
+from diransac.arrays import FloatArray
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import weights_of, with_residuals
+from diransac.identification.core.minimise import gauss_newton_step
+from diransac.identification.core.noise import NoiseSums
+from diransac.identification.core.scales import SHRINK, ProcessSums, negligible_jumps, process_sums, unbroken_jumps
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
-from diransac.identification.tracking.forces import gain_of_freedom
-from diransac.identification.tracking.surprise import is_surprised, weights_of_free_motion
+from diransac.identification.tracking.fits import free_motion, gain_of_freedom, is_surprised, left_by, part
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.arrowhead import Factored
+    from diransac.identification.core.equations import JointEquations
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.minimise import Step
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stream import Stream
 
-# Steps at most with another interval.
-_MOST_STEPS = 3
 AS_LIKELY = 5.0
 """Evidence, nats, by which a richer fit must be likelier; as in `local_search`."""
+MEMORY = 60.0
+"""Time over which noise, forces, drifts and the scatter of tests are remembered, s."""
 
 
 @dataclass(frozen=True)
@@ -78,43 +72,25 @@ class _Memory:
         )
 
 
-@dataclass(frozen=True)
-class Linearization:
-    """Normal equations of a window, the fit that they are of, and their solution.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-    at : NormalEquations
-    solved : Factored
-    """
-
-    intervals: ShootingIntervals
-    fit: Fit
-    at: NormalEquations
-    solved: Factored
-
-
 class Window:
     """Fit of the intervals of a window; changes as it moves on.
 
     Parameters
     ----------
     setup : Setup
+    fit : Fit
+        Of its intervals.
     stream : Stream
         Holds the rows of the window.
     first : int
         First row of the window.
-    fit : Fit
-        Of its intervals.
     spread : (n_signals,) array
         Of the signals, as in `Motion`.
     most : int
         Number of intervals of the window once it is full.
     """
 
-    def __init__(self, setup: Setup, stream: Stream, first: int, fit: Fit, spread: FloatArray, most: int) -> None:
+    def __init__(self, setup: Setup, fit: Fit, stream: Stream, first: int, spread: FloatArray, most: int) -> None:
         self.most = most
         self.setup, self.stream, self.first, self.fit, self._spread = setup, stream, first, fit, spread
         self.beginning = fit.boundary
@@ -128,8 +104,8 @@ class Window:
         self._found, self._gained = np.square(fit.tau), np.inf
         # Noise, forces, and parameters of a model that is not exact are remembered over a minute after the window: of a
         # sensor at 1 Hz it still gives the noise to 10 %.
-        self.kept = float(np.exp(-self.length * stream.dt / 60.0))
-        self.last: Linearization | None = None
+        self.kept = float(np.exp(-self.length * stream.dt / MEMORY))
+        self.last: Step | None = None
 
     def __len__(self) -> int:
         return len(self.fit.x)
@@ -165,53 +141,44 @@ class Window:
         """
         return np.where(self._measured, self.spread, self.expected)
 
-    def intervals(self) -> ShootingIntervals:
-        """The intervals with their rows as they are now."""
-        return self.setup.intervals(self.stream, self.first, len(self))
+    def intervals(self, first: int = 0, end: int | None = None) -> ShootingIntervals:
+        """The intervals, or some of them, with their rows as they are now."""
+        n = (len(self) if end is None else end) - first
+        return self.setup.intervals(self.stream, self.first + first * self.length, n)
 
     # ------------------------------------------------------------------ moving on
 
-    def extend(self, n: int) -> None:
-        """Add intervals that continue the last one."""
+    def extend(self, n: int, states: FloatArray | None = None) -> None:
+        """Add intervals that continue the last one, or those of a new stretch, which begin with states ``(n, n_x)``."""
+        if states is not None:
+            self._append(states, np.zeros((n, self.fit.d.shape[1])))
+            return
         for _ in range(n):
-            fit = self.fit
-            x, d = np.vstack([fit.x, fit.ends[-1:]]), np.vstack([fit.d, fit.rho * fit.d[-1:]])
-            self._append(replace(fit, x=x, d=d), 1)
+            self._append(self.fit.ends[-1:], self.fit.rho * self.fit.d[-1:])
 
-    def join(self, x: FloatArray) -> None:
-        """Add intervals of a new stretch that begin with given states ``(n, n_x)``."""
-        fit = self.fit
-        d = np.zeros((len(x), fit.d.shape[1]))
-        self._append(replace(fit, x=np.vstack([fit.x, x]), d=np.vstack([fit.d, d])), len(x))
-
-    def _append(self, fit: Fit, n: int) -> None:
-        """The fit with n more intervals, whose residuals are simulated."""
+    def _append(self, x: FloatArray, d: FloatArray) -> None:
+        """The fit with more intervals, whose residuals are simulated."""
+        n, now = len(x), self.fit
         self.times = np.append(self.times, self.stream.time(self.end) + self.length * self.stream.dt * np.arange(n))
-        self.fit = fit
+        self.fit = fit = replace(now, x=np.vstack([now.x, x]), d=np.vstack([now.d, d]))
         residuals, ends = self.intervals().simulated(fit.shared, fit.x, fit.d, np.arange(len(fit.x) - n, len(fit.x)))
         self.fit = replace(fit, residuals=np.vstack([fit.residuals, residuals]), ends=np.vstack([fit.ends, ends]))
 
     def leave(self, n: int) -> None:
         """Marginalise the first n intervals; their sums of noise and unmodelled accelerations are remembered."""
         assert self.last is not None
-        intervals, now, at = self.last.intervals, self.last.fit, self.last.at
-        boundary = _marginal(at, intervals, now, n)
-        rows = n * self.length
-        self._remember(intervals, now, n)
-        fit = self.fit
-        kept = {name: getattr(fit, name)[n:] for name in ("x", "d", "ends")}
-        self.fit = replace(fit, residuals=fit.residuals[rows:], boundary=boundary, **kept)
-        if not self.is_exact:  # errors of a model do not average out as noise does
-            self.fit = replace(self.fit, boundary=boundary.faded(self.kept**n))
+        rows, now = n * self.length, self.last.at
+        boundary = left_by(self.intervals(0, n + 1), part(now.fit, 0, n + 1), now.of_fit.weights[: rows + self.length])
+        self._remember(self.last, n)
+        # Errors of a model do not average out as noise does.
+        boundary = boundary if self.is_exact else boundary.faded(self.kept**n)
+        self.fit = replace(part(self.fit, n), boundary=boundary)
         self.first, self.times = self.first + rows, self.times[n:]
 
     def diffuse(self, std: FloatArray) -> None:
         """Random changes of the parameters, of given standard deviations ``(n_p,)``, before the window."""
-        changing = np.flatnonzero(std)
-        if self.fit.boundary is not None and len(changing):
-            root = np.zeros((len(std), len(changing)))
-            root[changing, np.arange(len(changing))] = std[changing]
-            self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(root))
+        if self.fit.boundary is not None and std.any():
+            self.fit = replace(self.fit, boundary=self.fit.boundary.diffused(np.diag(std)[:, std > 0.0]))
 
     def frozen(self) -> Window:
         """The window as it is now, while this one moves on."""
@@ -248,30 +215,34 @@ class Window:
 
     # ------------------------------------------------------------------ the fit
 
-    def optimise(self) -> Linearization:
-        """Steps of the fit and of its scales from the state of the window; the first linearisation."""
+    def optimise(self) -> JointEquations:
+        """Up to three steps of the fit and of its scales from the state of the window; the first equations."""
         intervals = self.intervals()
         self._measured |= measured_velocities(intervals)
-        weights = weights_of_free_motion(self) if is_surprised(self) else None
-        first: Linearization | None = None
-        damping = 0.0
-        for _ in range(_MOST_STEPS):
-            at = linearized(intervals, self.fit, weights)
-            before = self.fit
-            taken = gauss_newton_step(at, damping)
-            solved, damping = taken.solved, taken.damping
-            self.last = Linearization(intervals, before, at.of_fit, solved)
-            self.fit = self._with_scales(intervals, taken.fit, solved)
-            first = first or self.last
-            moved = np.abs(taken.fit.shared - before.shared)
-            if (moved <= 0.1 * np.sqrt(np.diag(solved.var_p))).all():
+        weights, damping = self._weights(intervals), 0.0
+        steps: list[Step] = []
+        while len(steps) < 3:
+            step = gauss_newton_step(linearized(intervals, self.fit, weights), damping)
+            damping, self.fit = step.damping, self._with_scales(intervals, step.fit, step.solved)
+            steps.append(step)
+            moved = np.abs(step.fit.shared - step.at.fit.shared)
+            if (moved <= 0.1 * np.sqrt(np.diag(step.solved.var_p))).all():
                 break
-        assert first is not None
-        assert self.last is not None
-        self._gained = gain_of_freedom(self.last, self.least, self.expected, self.largest)
+        self.last = steps[-1]
+        self._gained = gain_of_freedom(self.last.at, self.least, self.expected, self.largest)
         self._follow_spread(intervals)
         self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
-        return first
+        return steps[0].at
+
+    def _weights(self, intervals: ShootingIntervals) -> FloatArray | None:
+        """Weights of the samples where those of the fit are a surprise: in the last second, of a free motion."""
+        recent = max(len(self) - 2, 0)
+        if not is_surprised(self.intervals(recent), part(self.fit, recent)):
+            return None
+        first = max(len(self) - round(1.0 / (self.length * self.stream.dt)), 0)
+        last, weights = self.intervals(first), weights_of(intervals, self.fit)
+        weights[first * self.length :] = weights_of(last, free_motion(last, part(self.fit, first), self.largest))
+        return weights
 
     @property
     def is_hopeless(self) -> bool:
@@ -313,13 +284,13 @@ class Window:
         """Size ``(n_v,)`` of the unmodelled accelerations in the last minute before the window, or of any model."""
         return np.asarray(np.maximum(np.sqrt(self.memory.sizes / max(self.memory.count, 1.0)), self.expected))
 
-    def _remember(self, intervals: ShootingIntervals, fit: Fit, n: int) -> None:
+    def _remember(self, step: Step, n: int) -> None:
         """Add the sums of the first n intervals to those that are remembered, which fade."""
-        assert self.last is not None
+        intervals, fit = step.at.intervals, step.at.fit
         rows = slice(n * self.length)
         residuals, known = fit.residuals[rows], intervals.known[rows]
         noise = NoiseSums.of(residuals, known, fit.noise.inlying(residuals, known))
-        process = process_sums(intervals, fit, self.last.solved).part(slice(1, n + 1)).total()
+        process = process_sums(intervals, fit, step.solved).part(slice(1, n + 1)).total()
         # Forces that a start has taken for its errors are no evidence: it counts once all intervals are others.
         gained = n / len(intervals) * self._gained if len(self._memories) == self.most else 0.0
         self.memory = self.memory.extended(self.kept**n, _Memory(noise, process, n * self._found, n, gained))
@@ -330,86 +301,14 @@ class Window:
     def outliers(self, signals: list[tuple[str, int]]) -> dict[str, float]:
         """Fraction of the samples of some signals, by name and column, that are outliers."""
         assert self.last is not None
-        known = self.last.intervals.known
+        known = self.last.at.intervals.known
         inlying = self.fit.noise.inlying(self.fit.residuals, known).sum(axis=0)
         return {name: float(1.0 - inlying[k] / known[:, k].sum()) for name, k in signals}
 
     def last_state(self) -> dict[str, float]:
         """Most probable state in the last row."""
         assert self.last is not None
-        intervals, fit, last = self.last.intervals, self.fit, np.array([len(self) - 1])
+        intervals, fit, last = self.last.at.intervals, self.fit, np.array([len(self) - 1])
         series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d, last))
         state = self.setup.model.state
         return dict(zip(state, series[0, -1, : len(state)].tolist(), strict=True))
-
-
-# ---------------------------------------------------------------------- marginalisation
-
-
-def _marginal(at: NormalEquations, intervals: ShootingIntervals, fit: Fit, n: int) -> BoundaryPrior:
-    """Information of the first intervals of a fit, and its boundary, on the unknowns at the start of the next one.
-
-    Parameters
-    ----------
-    at : NormalEquations
-    intervals : ShootingIntervals
-        All with the same parameters.
-    fit : Fit
-        Of these equations.
-    n : int
-        Number of intervals that are marginalised, fewer than there are.
-
-    Returns
-    -------
-    BoundaryPrior
-        At the start of interval ``n``, linearised at the fit.
-    """
-    own = 1.0 / innovation_std(intervals, fit)
-    pull = -own * innovations(intervals, fit)
-    information, right = _beforehand(fit, own[0], pull[0])
-    k, n_x = at.right_z.shape[1], fit.x.shape[1]
-    known, known_right = information, right  # of interval w in its block of the equations
-    for w in range(n):
-        P, F = at.precision[w], at.slopes[w]
-        H, g = np.zeros((2 * k + len(right) - k,) * 2), np.zeros(2 * k + len(right) - k)
-        z, then, s = slice(0, k), slice(k, 2 * k), slice(2 * k, None)
-        H[z, z] = at.system.diagonal[w] + information[:k, :k] - known[:k, :k]
-        H[z, s] = at.system.border[w] + information[:k, k:] - known[:k, k:]
-        H[s, s] = at.corners[w] + information[k:, k:]
-        H[then, z] = at.system.below[w]
-        g[z], g[s] = at.right_z[w] + right[:k] - known_right[:k], at.rights[w] + right[k:]
-        known, known_right = np.zeros_like(information), np.zeros_like(right)
-        known[:n_x, :n_x], known[n_x:k, n_x:k] = np.diag(P), np.diag(np.square(own[w + 1]))
-        known[:n_x, k:] = -P[:, None] * F[:, k:]
-        known_right[:k] = np.concatenate([-P * at.jumps[w], pull[w + 1]])
-        H[then, then], H[then, s], g[then] = known[:k, :k], known[:k, k:], known_right[:k]
-        information, right = _eliminated(H, g, k)
-    point = np.concatenate([fit.x[n], fit.d[n], fit.shared])
-    return BoundaryPrior.of_information(point, information, right)
-
-
-def _beforehand(fit: Fit, own: FloatArray, pull: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information and right-hand side of the first interval's unknowns before its measurements."""
-    if fit.boundary is not None:
-        return fit.boundary.information, fit.boundary.right(fit.at_boundary)
-    n_x = fit.x.shape[1]
-    k = n_x + len(own)
-    information, right = np.zeros((k + len(fit.shared),) * 2), np.zeros(k + len(fit.shared))
-    information[n_x:k, n_x:k], right[n_x:k] = np.diag(np.square(own)), pull
-    return information, right
-
-
-def _eliminated(H: FloatArray, g: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
-    """Schur complement of the first k unknowns, and its right side.
-
-    Couplings of these to the next k are below the diagonal, all others above.
-    """
-    n = len(g) - k
-    coupling = np.concatenate([H[k : 2 * k, :k], H[:k, 2 * k :].T])
-    rest = np.triu(H[k:, k:]) + np.triu(H[k:, k:], 1).T
-    scale = 1.0 / np.sqrt(size_or_one(np.diag(H)[:k]))
-    # A ridge keeps an unknown which nothing determines.
-    scaled = H[:k, :k] * np.outer(scale, scale) + 1e-13 * np.eye(k)
-    solved = np.linalg.solve(scaled, scale[:, None] * np.column_stack([coupling.T, g[:k]]))
-    taken = (coupling * scale) @ solved
-    return rest - taken[:, :n], g[k:] - taken[:, n]

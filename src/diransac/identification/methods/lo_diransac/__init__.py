@@ -1,6 +1,7 @@
 """The method lo-diransac: random minimal samples, consensus by simulation, local optimisation.
 
-In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with `method.py`.
+In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with `method.py`; the fit itself is
+`identification/core`.
 
 | file | content |
 |---|---|
@@ -8,21 +9,13 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | **the logs** | |
 | `preparation.py` | logs in intervals; rows that are left out |
 | `smoothing.py`, `unmeasured.py` | the motion without a model; states that no signal measures |
-| `shooting.py` | logs as intervals, each a rollout of the augmented model |
-| `augmented_model.py`, `corrections.py` | the model with discrepancies; errors of sensors and inputs, `ErrorKind` |
 | **the search** | |
 | `search.py`, `hypotheses.py` | the likeliest explanation; samples in weak form, consensus |
 | `local_search.py` | explanations of a log, of which the likeliest is chosen |
-| **the fit** | |
-| `refinement.py`, `gauss_newton.py` | local optimisation, from easy to exact, and its steps |
-| `normal_equations.py`, `arrowhead.py` | all intervals as one quadratic, and its solution in O(N) |
-| `mixture.py`, `scales.py` | noise: a Gaussian and outliers; scales of unmodelled accelerations |
-| `boundary.py` | knowledge from before a window |
 | `integration_steps.py` | as few integration steps as leave the fit |
 | **errors of recordings** | |
-| `recording_errors.py`, `joint_equations.py` | delays, biases, lags, drifts: their search, and as unknowns of a fit |
+| `recording_errors.py` | search of delays, biases, lags, drifts |
 | `input_noise.py` | noise of inputs, as errors that are unknowns of each interval |
-| `score_tests.py` | tests of effects that are not in a fit |
 | **parameters and findings** | |
 | `projection.py`, `interval_effects.py` | parameters and covariance; effects of each interval |
 | `motion_equations.py` | residuals and regressors on the motion |

@@ -14,10 +14,10 @@ from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
     from diransac.arrays import FloatArray
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.parts import Parts
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 
 def findings_of_fit(found: Explanation, parts: Parts, acting: ActingInputs | None) -> Iterator[Finding]:

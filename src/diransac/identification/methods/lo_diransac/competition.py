@@ -50,10 +50,10 @@ from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5

@@ -11,8 +11,8 @@ from diransac.identification.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.methods.lo_diransac.mixture import Mixture
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.noise import Mixture
+    from diransac.identification.core.windows import ShootingIntervals
 
 _OUTLIER = 0.5
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
 from diransac.data.input_timing import acting_inputs
+from diransac.identification.core.noise import Mixture
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums
 from diransac.identification.methods.lo_diransac.linear_intervals import (
     RADIUS,
@@ -28,12 +29,11 @@ from diransac.identification.methods.lo_diransac.linear_intervals import (
     LinearInterval,
     Update,
 )
-from diransac.identification.methods.lo_diransac.mixture import Mixture
 from diransac.simulation import Measurements, RolloutBatch, default_threads, rollouts
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.simulation.mujoco import MujocoRollouts
 
 _FIRST = 5

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.core.noise import lower_scale
 from diransac.identification.methods.lo_diransac.segments import (
     OUTLYING,
     Segments,
@@ -27,8 +27,8 @@ from diransac.identification.methods.lo_diransac.segments import (
 )
 
 if TYPE_CHECKING:
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
 

@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, row_blocks
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.core.noise import lower_scale
 from diransac.identification.methods.samples import sample_rows
 from diransac.identification.regression.rows import regression_rows
 from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset, ParameterLayout
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.regression.estimators import BoundEstimator
 

@@ -19,22 +19,22 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import acting_inputs
-from diransac.identification.methods.lo_diransac.corrections import ErrorKind
+from diransac.identification.core.equations import linearize
+from diransac.identification.core.fit import split, weights_of, with_residuals
+from diransac.identification.core.minimise import Refinement, minimise
+from diransac.identification.core.noise import NoiseSums
+from diransac.identification.core.scales import CONTINUITY, SHRINK, negligible_jumps, process_sums
+from diransac.identification.core.theta import ErrorKind
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms
-from diransac.identification.methods.lo_diransac.mixture import NoiseSums
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, split, weights_of, with_residuals
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters
-from diransac.identification.methods.lo_diransac.refinement import Refinement, minimise
-from diransac.identification.methods.lo_diransac.scales import CONTINUITY, SHRINK, negligible_jumps, process_sums
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.gauss_newton import Step
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.minimise import Prior, Step
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.refinement import Prior
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.structure.candidate_terms import TermLibrary
 
 # Noise of an input, over its RMS: with which a fit starts, and what counts as none.

@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import row_blocks
-from diransac.identification.methods.lo_diransac.joint_equations import bounded
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    linearize,
-    weights_of,
-    with_residuals,
-)
+from diransac.identification.core.equations import linearize
+from diransac.identification.core.fit import weights_of, with_residuals
+from diransac.identification.core.theta import bounded
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.arrowhead import Factored
+    from diransac.identification.core.equations import NormalEquations
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
 
 # Change of a parameter, standard errors, that adds half a per cent to its uncertainty, and of the cost, nats.
 _NEGLIGIBLE, _NEGLIGIBLE_COST = 0.1, 0.5

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
+from diransac.identification.core.equations import linearize
+from diransac.identification.core.fit import weights_of
 from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
 
 # Fewest batches of correlated intervals.
 _BATCHES = 4

@@ -20,8 +20,8 @@ from diransac.identification.methods.lo_diransac.motion_equations import residua
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 
 if TYPE_CHECKING:
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
     from diransac.model import Model

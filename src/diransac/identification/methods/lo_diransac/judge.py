@@ -24,8 +24,8 @@ from diransac.identification.methods.lo_diransac.inverse import Inverse
 from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
 

@@ -19,8 +19,12 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import TimeLimitError
+from diransac.identification.core.equations import linearized
+from diransac.identification.core.fit import split, with_residuals
+from diransac.identification.core.minimise import refine, refine_exact, refine_further, start
+from diransac.identification.core.theta import ErrorKind
+from diransac.identification.core.windows import SHORTEST_LAG, ShootingIntervals
 from diransac.identification.method import report
-from diransac.identification.methods.lo_diransac.corrections import ErrorKind
 from diransac.identification.methods.lo_diransac.input_noise import (
     averaged_noise,
     explains_all,
@@ -30,26 +34,23 @@ from diransac.identification.methods.lo_diransac.input_noise import (
     simpler_timings,
 )
 from diransac.identification.methods.lo_diransac.integration_steps import answer, with_fewest_steps
-from diransac.identification.methods.lo_diransac.joint_equations import RecordingError, linearized
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
-from diransac.identification.methods.lo_diransac.normal_equations import split, with_residuals
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters, projected_parameters
 from diransac.identification.methods.lo_diransac.recording_errors import (
+    RecordingError,
     clear_errors,
     errors_of_inputs,
     errors_of_signals,
     with_errors,
 )
-from diransac.identification.methods.lo_diransac.refinement import refine, refine_exact, refine_further, start
-from diransac.identification.methods.lo_diransac.shooting import SHORTEST_LAG, ShootingIntervals
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.minimise import Prior, Refinement
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.refinement import Prior, Refinement
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -58,8 +59,10 @@ LATE: tuple[Literal["delay", "lag"], ...] = ("delay", "lag")
 AS_LIKELY = 5.0
 """Difference of two fits' evidence, nats, below which both are as likely."""
 
-# Shortest interval, samples.
 _SHORTEST = 3
+"""Shortest interval, samples."""
+_MOST_ERRORS = 8
+"""Errors of recordings that the settings do not name, at most."""
 # Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
 _EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
 # Delays, samples, of held inputs that vary between samples.
@@ -216,7 +219,7 @@ class LocalSearch:
 
     def _with_more_errors(self, best: Explanation, *, free_hold: bool) -> Iterator[Explanation]:
         """Ever likelier explanations with further errors of recordings, or another hold of the inputs."""
-        for k in range(self.settings.max_recording_errors):
+        for k in range(_MOST_ERRORS):
             report(self.callback, "errors of the recordings", 0.6 + 0.03 * k)
             found = [self._simplified(x) for x in self._with_another_error(best, free_hold=free_hold)]
             if not found:

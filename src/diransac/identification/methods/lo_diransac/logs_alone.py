@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.errors import IdentificationError
+from diransac.identification.core.minimise import make_prior
 from diransac.identification.estimate import LogEstimate
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.local_search import LocalSearch
 from diransac.identification.methods.lo_diransac.motion_equations import discrepancy_units
 from diransac.identification.methods.lo_diransac.preparation import FEWEST_INTERVALS
-from diransac.identification.methods.lo_diransac.refinement import make_prior
 from diransac.identification.methods.lo_diransac.search import Searched, parameters_of
 from diransac.identification.methods.lo_diransac.simulation_error import estimates_of_logs
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 
 def estimates_alone(

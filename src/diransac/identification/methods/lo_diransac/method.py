@@ -17,6 +17,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
@@ -33,7 +34,6 @@ from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -49,10 +49,10 @@ from diransac.process import memory_kept
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.fit import Fit
     from diransac.identification.estimate import LogEstimate
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.missing_terms import Candidates, MissingTerms
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.settings import Settings
 
 _GAUSSIAN = 10_000
@@ -87,9 +87,6 @@ class LoDiransac(LoDiransacSettings):
         Signals, or inputs, whose delay is estimated in any case, signals whose bias is, and inputs whose gain drifts;
         that of no other is.  An input's delay is its own, besides that of all.  None: those that the residuals show
         clearly.
-    max_recording_errors : int, optional
-        Largest number of unnamed ones of these that are estimated, the timing of all inputs included; where the model
-        is exact, only those of inputs, of groups of sensors, and of sensors with a measurement equation.
     substeps : int, optional
         Integration steps per sample at most: fewer where these change no parameter by a tenth of its standard error.
         One step is inaccurate by a percent where dry friction changes sign between samples or links are light.
@@ -101,9 +98,8 @@ class LoDiransac(LoDiransacSettings):
         Whether the size of unmodelled accelerations is estimated; otherwise they vanish.
     prior_model_error : float, optional
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
-    prior_discrepancy, initial_discrepancy : float, optional
-        Size of input gain and bias discrepancies, over that which equals an equation's inertial force: of the prior,
-        and before the evidence determines it.
+    prior_discrepancy : float, optional
+        Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force.
     projection : bool, optional
         Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
         those of the fit.

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, row_blocks
+from diransac.identification.core.fit import split
 from diransac.identification.methods.lo_diransac.motion_equations import (
     equations_of_rows,
     inertia_slopes,
@@ -32,7 +33,6 @@ from diransac.identification.methods.lo_diransac.motion_equations import (
     residuals_of_motion,
     slopes_of_delays,
 )
-from diransac.identification.methods.lo_diransac.normal_equations import split
 from diransac.identification.methods.lo_diransac.term_evidence import CandidateTests, TermRegression, probabilities
 from diransac.identification.methods.lo_diransac.term_regression import parts_of_intervals, term_regression
 from diransac.identification.methods.lo_diransac.unmeasured import measured_signals, unmeasured_states
@@ -41,9 +41,9 @@ from diransac.identification.structure.lacking_terms import PossibleTerm, name_o
 from diransac.identification.structure.structural import structural
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.structure.candidate_terms import CandidateTerm, CandidateTerms
     from diransac.identification.structure.lacking_terms import Suggestion
     from diransac.model import Model

@@ -14,8 +14,8 @@ from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
     from diransac.simulation.compiler import Map

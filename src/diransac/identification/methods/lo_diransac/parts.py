@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.core.equations import variances_of_intervals
+from diransac.identification.core.fit import weights_of
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
 from diransac.identification.methods.lo_diransac.motion_equations import means_of_intervals, residuals_of_motion
-from diransac.identification.methods.lo_diransac.normal_equations import variances_of_intervals, weights_of
 from diransac.identification.methods.lo_diransac.projection import least_squares_gains, means_of_windows
 
 if TYPE_CHECKING:
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.local_search import Explanation
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 # A difference of parameters: so many standard errors, and this part of the parameter.
 _CLEAR, _DIFFERENT = 4.0, 0.03

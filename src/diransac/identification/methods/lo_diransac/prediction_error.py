@@ -21,8 +21,8 @@ from diransac.identification.regression.uncertainty import CLEAR
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from diransac.identification.core.noise import Mixture
     from diransac.identification.methods.lo_diransac.following import Pass, Predictor
-    from diransac.identification.methods.lo_diransac.mixture import Mixture
 
 _PASSES, _CONVERGED, _LEAST_REACH, _LIKELIER = 30, 0.5, 0.1, 1.0
 """Passes at most; mean step of the parameters, standard errors, over the latest passes, that ends them; part of a step

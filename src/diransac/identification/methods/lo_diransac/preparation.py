@@ -10,7 +10,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, long_runs, robust_std, runs
 from diransac.data.segment import silent_rows
 from diransac.errors import LogError
-from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.core.windows import ShootingIntervals
 from diransac.identification.methods.lo_diransac.smoothing import Motion, Samples, choose_half_widths, smooth
 from diransac.simulation import default_threads
 

@@ -37,21 +37,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.identification.core.equations import effect_on, linearize
+from diransac.identification.core.fit import weights_of
 from diransac.identification.methods.lo_diransac.hypotheses import WeakForm
 from diransac.identification.methods.lo_diransac.interval_effects import batch_sums, effect_of_intervals
-from diransac.identification.methods.lo_diransac.joint_equations import effect_on
 from diransac.identification.methods.lo_diransac.motion_equations import (
     means_of_intervals,
     residuals_of_motion,
     unexplained,
 )
-from diransac.identification.methods.lo_diransac.normal_equations import linearize, weights_of
 from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.regression.uncertainty import combined
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
 
 _TINY = 1e-300
 # Factor of the standard deviations of priors in the covariance that is combined with them.

@@ -8,23 +8,20 @@ error is an unknown of the fit as others (`joint_equations`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from diransac.arrays import BoolArray
-from diransac.identification.methods.lo_diransac.corrections import ErrorKind
-from diransac.identification.methods.lo_diransac.joint_equations import (
-    JointEquations,
-    RecordingError,
-    errors_tested,
-    is_possible,
-    signal_rates,
-)
+from diransac.identification.core.columns import Columns, changes_by, recorrected, scores_tested, signal_rates
+from diransac.identification.core.equations import JointEquations, linearize
+from diransac.identification.core.fit import weights_of
+from diransac.identification.core.theta import ErrorKind, is_possible, largest_size
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
 
 LEAST_DELAY = 0.1
 """Delay, samples, from which on one is tried, and named."""
@@ -38,6 +35,32 @@ _NUMBERS_AT_A_TIME = 1_000_000
 # Signals that are known in fewer rows than this are not tested.
 _FEWEST = 50
 _OF_INPUTS: tuple[Literal["delay", "lag", "drift"], ...] = ("delay", "lag", "drift")
+
+
+@dataclass(frozen=True)
+class RecordingError:
+    """An error of one signal or input, or of a group.
+
+    Parameters
+    ----------
+    kind : ErrorKind
+    size : float
+        Its estimate: samples, the signal's unit, or relative to the gain.
+    std : float
+        Its standard error.
+    gain : float
+        Evidence that it would gain, nats, if the residuals were white.
+    """
+
+    kind: ErrorKind
+    size: float
+    std: float
+    gain: float
+
+    @property
+    def ratio(self) -> float:
+        """Its size over its standard error."""
+        return abs(self.size) / self.std
 
 
 def clear_errors(
@@ -78,6 +101,40 @@ def clear_errors(
     inputs.sort(key=lambda x: x.gain + worth * (x.kind in common))  # an input without effect has no timing of its own
     likeliest = {x.kind.what: x for x in inputs}
     return [*single[:1], *groups[:_GROUPS], *likeliest.values()]
+
+
+def errors_tested(
+    intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind], at_a_time: int
+) -> list[RecordingError]:
+    """Estimates of errors one by one, given all else that is estimated.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        At its optimum.
+    kinds : sequence of ErrorKind
+    at_a_time : int
+        Number of errors whose sensitivities, of a number for every sample, are held at a time.
+    """
+    intervals, fit, rates = recorrected(intervals, fit)
+    at, n, errors = linearize(intervals, fit, weights_of(intervals, fit)), len(intervals), list[RecordingError]()
+    for part in (kinds[k : k + at_a_time] for k in range(0, len(kinds), at_a_time)):
+        changes = changes_by(intervals, fit, part, rates)
+        directions = [own for own, _ in changes]
+        along = intervals.gauss_newton(
+            fit.shared, fit.x, fit.d, at.weights, directions=directions, normal_matrix=False
+        ).along
+        tests = scores_tested(at, Columns.of(intervals, at, changes, along).slopes(at))
+        batches = np.add.reduceat(tests.scores, np.arange(0, n, max(1, round(np.sqrt(n)))), axis=0)
+        precision = np.array([largest_size(intervals, x) for x in part]) ** -2.0
+        information = np.maximum(tests.information, 0.0) + precision
+        std = np.sqrt(np.maximum(information, np.square(batches).sum(axis=0))) / information
+        size = -tests.score / information
+        gain = -0.5 * tests.score * size  # which overflows where the rollouts of a fit nearly do
+        each = zip(part, size.tolist(), std.tolist(), gain.tolist(), strict=True)
+        errors += [RecordingError(*x) for x in each if x[3] < np.inf]
+    return errors
 
 
 def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:

@@ -12,6 +12,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.data.input_timing import InputTiming
 from diransac.errors import IdentificationError, TimeLimitError
+from diransac.identification.core.minimise import diverges, make_prior, start
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
 from diransac.identification.methods.lo_diransac.local_search import AS_LIKELY, LATE, LocalSearch
@@ -22,7 +23,6 @@ from diransac.identification.methods.lo_diransac.projection import (
     fitted_parameters,
 )
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY, errors_of
-from diransac.identification.methods.lo_diransac.refinement import diverges, make_prior, start
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -39,13 +39,13 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.estimate import Competition
     from diransac.identification.method import Callback
-    from diransac.identification.methods.lo_diransac.joint_equations import RecordingError
     from diransac.identification.methods.lo_diransac.local_search import Explanation
+    from diransac.identification.methods.lo_diransac.recording_errors import RecordingError
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Candidate
 

@@ -16,17 +16,16 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import InputTiming
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.core.noise import lower_scale
+from diransac.identification.core.windows import DIVERGED
 from diransac.identification.regression.multistart import least_squares
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
 
-DIVERGED = 1e50
-"""Error after a divergence, and state from which on squares of its derivatives overflow, whatever their units."""
 _STATE_STEPS = 15
 OUTLYING = 6.0
 """Robust standard deviations from which on a sample is far from a motion."""

@@ -38,14 +38,12 @@ class LoDiransacSettings:
     sensor_delays: tuple[str, ...] | None = None
     sensor_biases: tuple[str, ...] | None = None
     gain_drifts: tuple[str, ...] | None = None
-    max_recording_errors: int = 8
     substeps: int = 5
     max_steps: int = 60
     outliers: bool = True
     model_error: bool = True
     prior_model_error: float = 1e-3
     prior_discrepancy: float = 0.1
-    initial_discrepancy: float = 0.01
     projection: bool = True
     sources: tuple[str, ...] = SOURCES
     start: Mapping[str, float] | None = None
@@ -126,7 +124,6 @@ _SWITCHES = ("input_delay", "input_lag")
 _NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts")
 _MAY_BE_ZERO = (
     "n_samples",
-    "max_recording_errors",
     "max_steps",
     "prior_model_error",
     "prior_discrepancy",

@@ -22,17 +22,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
+from diransac.identification.core.equations import linearize, without_windows
+from diransac.identification.core.fit import Fit, weights_of, with_residuals
+from diransac.identification.core.minimise import HOPELESS, SIGMA_FLOOR, SegmentsApart, minimise
+from diransac.identification.core.noise import Mixture, lower_scale
+from diransac.identification.core.theta import bounded
 from diransac.identification.estimate import LogEstimate
-from diransac.identification.methods.lo_diransac.joint_equations import bounded
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    Fit,
-    linearize,
-    weights_of,
-    with_residuals,
-    without_windows,
-)
-from diransac.identification.methods.lo_diransac.refinement import HOPELESS, SegmentsApart, minimise
 from diransac.identification.methods.lo_diransac.segments import (
     ActingInputs,
     Segments,
@@ -45,26 +40,31 @@ from diransac.identification.methods.lo_diransac.sources import Blocks, Candidat
 
 if TYPE_CHECKING:
     from diransac.arrays import IntArray
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-_SHORTEST, _GROWTH = 8, 3
-"""Rows of the shortest segments at least, and the factor by which they grow, up to the length of a block."""
-_N_RANDOM, _DECADES = 16, 1.0
-"""Number of random starts, and how far from known parameters they are."""
-_SCREENED, _FOLLOWED = 16, 2
-"""Segments on which all starts are scored, and the number of starts that are followed."""
-_ROWS_OF_SEARCH, _MOST_ROWS = 3_000, 50_000
-"""Rows of the fits from several starts, and of others, at most."""
-_WHOLE_ROW = 1.0 / 12.0
-"""Variance of a number that is rounded to a whole one."""
+_SHORTEST = 8
+"""Least rows of the shortest segments."""
+_GROWTH = 3
+"""Factor by which segments grow, up to the length of a block."""
+_FEW = 16
+"""Number of random starts, and of segments on which all starts are scored."""
+_FOLLOWED = 2
+"""Number of starts that are followed."""
+_ROWS_OF_SEARCH = 3_000
+"""Largest number of rows of fits from several starts."""
+_MOST_ROWS = 50_000
+"""Largest number of rows of other fits."""
 _STEPS = 25
 """Largest number of steps."""
 _FEW_STEPS = 3
 """Steps of a solution that is close to another."""
 _SIMULATED = 0.5
 """Robust scale of the errors over the spread of a signal, up to which a simulation follows it."""
-_RIDGE, _FLOOR, _TINY = 1e-10, 1e-5, 1e-150
+_RIDGE = 1e-10
+"""Part of the largest singular value below which a direction of the parameters is undetermined."""
+_TINY = 1e-150
+"""A parameter's unit where it has no effect."""
 
 
 def simulation_error_candidates(
@@ -173,16 +173,16 @@ def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -
     bounds = intervals.layout.bounds
     lower, upper = np.array([[x.lower, x.upper] for x in bounds]).T
     both, found = np.isfinite(lower) & np.isfinite(upper), []
-    for k in range(_N_RANDOM):
+    for k in range(_FEW):
         rng = np.random.default_rng([abs(seed), int(seed < 0), k])
-        about = known[k % len(known)] * 10.0 ** rng.uniform(-_DECADES, _DECADES, len(bounds))
+        about = known[k % len(known)] * 10.0 ** rng.uniform(-1.0, 1.0, len(bounds))
         inside = rng.uniform(np.where(both, lower, 0.0), np.where(both, upper, 1.0))
         found.append(np.clip(np.where(both, inside, about), lower, upper))
     return np.array(found)
 
 
 def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, most_rows: int) -> Segments:
-    """Segments one after another in all stretches; every so-manieth one where there are too many rows."""
+    """Segments one after another in all stretches; every k-th one where there are too many rows."""
     parts = [np.arange(x.start, x.stop - length + 1, length) for x in stretches(intervals)]
     starts = np.concatenate([np.arange(0), *parts])
     return Segments(intervals, acting, starts[:: max(1, -(-len(starts) * length // most_rows))], length)
@@ -214,12 +214,12 @@ def _first_noise(segments: Segments, spread: FloatArray, *, outliers: bool) -> M
     high = np.where(intervals.sampled, intervals.measured, -np.inf).max(axis=0)
     span, columns = np.where(high > low, high - low, 1.0), set(segments.columns.tolist())
     whole = [four for four in intervals.model.quaternions if columns.issuperset(four)]
-    return Mixture(0.1 * spread, np.full(len(spread), 0.1 * outliers), span, _FLOOR * spread, whole)
+    return Mixture(0.1 * spread, np.full(len(spread), 0.1 * outliers), span, SIGMA_FLOOR * spread, whole)
 
 
 def _scores(segments: Segments, motion: Motion, starts: FloatArray, noise: Mixture) -> FloatArray:
     """Sum ``(m,)`` over signals of the logarithm of a robust scale of the errors over a few segments."""
-    few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _SCREENED)])
+    few = replace(segments, starts=segments.starts[:: max(1, len(segments) // _FEW)])
     lanes = np.repeat(starts[:, None], len(few), axis=1)
     errors = few.errors(lanes, _first_states(few, motion, lanes, noise)[0])
     known = few.known.reshape(-1, errors.shape[3])
@@ -377,7 +377,7 @@ class _Solution:
             return tried[at], at, np.inf
         before, now, after = (tried[at + x].costs_without(blocks) for x in (-1, 0, 1))
         vertex = 0.5 * (before - after) / np.maximum(before - 2.0 * now + after, _TINY)
-        return tried[at], at, float(np.sqrt(_WHOLE_ROW + jackknife(np.clip(vertex, -1.0, 1.0)[:, None])[0, 0]))
+        return tried[at], at, float(np.sqrt(1.0 / 12.0 + jackknife(np.clip(vertex, -1.0, 1.0)[:, None])[0, 0]))
 
     def costs_without(self, blocks: Blocks) -> FloatArray:
         """Negative log-likelihood of the samples without each block."""

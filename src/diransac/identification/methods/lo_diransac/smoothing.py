@@ -26,7 +26,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray, interpolated, robust_std, size_or_one
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
-from diransac.identification.methods.lo_diransac.mixture import lower_scale
+from diransac.identification.core.noise import lower_scale
 from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from diransac.time_limit import check_time
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.data.log import Log
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.model import Model, Parameter
 
 N_BLOCKS = 10

@@ -17,19 +17,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    innovation_std,
-    linearize,
-    of_logs,
-    sum_of_products,
-    weights_of,
-)
+from diransac.identification.core.equations import linearize
+from diransac.identification.core.fit import innovation_std, weights_of
+from diransac.identification.core.theta import of_logs, sum_of_products
 from diransac.identification.methods.lo_diransac.term_evidence import TermRegression
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit, NormalEquations
+    from diransac.identification.core.equations import NormalEquations
+    from diransac.identification.core.fit import Fit
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.simulation import GaussNewtonBatch
 
 # Numbers of equations that are solved at once (80 MB, a tenth of a second), at most; of a section of more.

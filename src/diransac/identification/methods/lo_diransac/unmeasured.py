@@ -19,7 +19,7 @@ from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 

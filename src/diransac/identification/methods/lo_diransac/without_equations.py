@@ -26,9 +26,9 @@ from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
+    from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
 
 _SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
 """Samples of an interval; intervals of the logs at least."""

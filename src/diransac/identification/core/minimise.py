@@ -1,8 +1,8 @@
-"""Local optimisation: the most probable motion, parameters and discrepancies, given the logs.
+"""The one loop: Gauss-Newton steps, each followed by an update of every scale by the schedule of the fit.
 
-Gauss-Newton steps on `normal_equations`, each followed by an update of every scale:
+The scales of `Flexible`:
 
-- the noise of each signal, by EM (`mixture`);
+- the noise of each signal, by EM (`noise`);
 - tau, the size of the unmodelled accelerations, by the evidence: with tau large, intervals stand alone; with tau = 0,
   a log is one rollout.  Models of real machines are accurate to a thousandth of the accelerations at best; this prior
   has the weight of one interval, so that tau does not vanish where noise hides the discrepancies;
@@ -20,54 +20,127 @@ MacKay 1992 (evidence updates); Chung et al. 2013 (scales that are kept off zero
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.identification.methods.lo_diransac.gauss_newton import gauss_newton_step
-from diransac.identification.methods.lo_diransac.joint_equations import linearized
-from diransac.identification.methods.lo_diransac.mixture import Mixture, lower_scale
-from diransac.identification.methods.lo_diransac.normal_equations import (
-    Fit,
-    cost,
-    innovation_std,
-    with_residuals,
-)
-from diransac.identification.methods.lo_diransac.scales import (
+from diransac.identification.core.arrowhead import Factored
+from diransac.identification.core.equations import JointEquations, cost, linearized
+from diransac.identification.core.fit import Fit, innovation_std, with_residuals
+from diransac.identification.core.noise import Mixture, lower_scale
+from diransac.identification.core.scales import (
     SHRINK,
     most_probable_size,
     negligible_jumps,
     process_sums,
     unbroken_jumps,
 )
-from diransac.identification.methods.lo_diransac.segments import DIVERGED
+from diransac.identification.core.windows import DIVERGED, ShootingIntervals
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.gauss_newton import Step
-    from diransac.identification.methods.lo_diransac.joint_equations import JointEquations
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
 
-# Where tau starts, in spreads of the accelerations.
+_MAX_TRIALS = 8
+_CORRECTED = 0.3
+"""Largest part of the excess of cost that a correction for the curvature of the rollouts may leave."""
+_FIRST_DAMPING = 1e-7
+"""Damping of the first step that needs one."""
+_LEAST_DAMPING = 1e-9
+"""Damping below which there is none."""
+_ROUNDING = 1e-9
+"""Relative change of the cost that is none."""
 _TAU_START = 0.3
-_SIGMA_FLOOR = 1e-5
-# Prior size of the unmodelled accelerations at least, in spreads of the accelerations: none would make them singular.
+"""Size of unmodelled accelerations at the start of a fit, in spreads of the accelerations."""
+_GUARDED = 0.1
+"""Size of discrepancies at the start of a fit, over that of their prior."""
+SIGMA_FLOOR = 1e-5
+"""Least noise of a signal, over its spread."""
 _LEAST_PRIOR = 1e-6
+"""Least prior size of unmodelled accelerations, in their spreads: none would make the equations singular."""
 _EXACT = 1e-3
 """Unmodelled accelerations of a model that is taken to be exact, over their prior size."""
 _OFF = 1e-8
 """Input gain and bias discrepancies that are off, over that which equals an equation's inertial force."""
-# Where they start, and the factor by which they are lowered in a step.
-_NEARLY_EXACT, _TIGHTENED = 10.0, 0.1
-_MAX_SWEEPS = 12
+_NEARLY_EXACT = 10.0
+"""Unmodelled accelerations at the start of an exact fit, over their prior size."""
+_TIGHTENED = 0.1
+"""Factor by which a step lowers the scales of an exact fit."""
+_LOOSE = 10.0
+"""Change of an error of a recording that ends a fit, over that of a parameter."""
 HOPELESS = 0.1
 """Loss of log-likelihood per sample, of errors a tenth larger, from which on a fit is clearly less likely."""
-# Change of an error of a recording over its standard error that ends a fit.
-_ERRORS_SETTLED = 0.1
+
+
+@dataclass(frozen=True)
+class Step:
+    """Step of a fit.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    fit : Fit
+        After the step.
+    at : JointEquations
+        Before it.
+    taken : Factored or None
+        None of a damped one.
+    damping : float
+        Of the next step.
+    """
+
+    intervals: ShootingIntervals
+    fit: Fit
+    at: JointEquations
+    taken: Factored | None
+    damping: float
+
+    @cached_property
+    def solved(self) -> Factored:
+        """Solution without damping, which is no information: scales and standard errors follow from it."""
+        return self.taken or self.at.solve()
+
+    @property
+    def of_errors(self) -> float:
+        """Largest change of an error of the recordings over its standard error."""
+        sizes, std, _ = self.at.errors_of(self.solved)
+        return float((np.abs(sizes) / std).max(initial=0.0))
+
+
+def gauss_newton_step(at: JointEquations, damping: float) -> Step:
+    """One Gauss-Newton step within the bounds, corrected or damped until the cost falls.
+
+    Parameters
+    ----------
+    at : JointEquations
+        Result of `linearized`.
+    damping : float
+
+    Returns
+    -------
+    Step
+    """
+    intervals, fit, weights = at.intervals, at.fit, at.of_fit.weights
+    before = cost(intervals, fit, weights)
+    for trials in range(_MAX_TRIALS):
+        right, excess = at.right, np.inf
+        while True:
+            step = at.solve(right, damping)
+            there, trial = at.moved(step)
+            more = cost(there, trial, intervals.weights_in(there, weights)) - before
+            if more <= _ROUNDING * before:
+                least = damping if trials else damping / 10.0 if damping > _LEAST_DAMPING else 0.0
+                return Step(there, trial, at, None if damping else step, least)
+            if not more < _CORRECTED * excess:
+                break
+            right, excess = at.corrected(there, trial), more
+            del step, trial  # the next ones take as much memory
+        damping = max(10.0 * damping, _FIRST_DAMPING)
+    return Step(intervals, fit, at, None, damping)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -141,7 +214,7 @@ def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motio
         tau=max(settings.prior_model_error, _LEAST_PRIOR) * _accelerations(intervals.model, motion),
         unit=unit,
         discrepancy=settings.prior_discrepancy,
-        guarded=settings.initial_discrepancy,
+        guarded=max(_GUARDED * settings.prior_discrepancy, _OFF),
     )
 
 
@@ -174,7 +247,7 @@ def start(
     x, d = motion.signals[intervals.starts, :n_x].copy(), np.zeros((len(intervals), n_v))
     shared = np.concatenate([p, np.zeros(intervals.n_shared - len(p))])
     residuals, ends = intervals.simulated(shared, x, d)
-    floor = _SIGMA_FLOOR * motion.spread
+    floor = SIGMA_FLOOR * motion.spread
     sigma = 1.5 * np.maximum(np.nan_to_num(lower_scale(residuals, intervals.known), nan=1.0), floor)
     low = np.where(intervals.known, intervals.measured, np.inf).min(axis=0)
     high = np.where(intervals.known, intervals.measured, -np.inf).max(axis=0)
@@ -198,7 +271,7 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
     n, losses = len(intervals), _losses(intervals, fit.noise, fit.residuals, fit.ends, np.arange(len(intervals)))
     # States that changed since those of their neighbours were last propagated from them: others give what they gave.
     forward, backward = np.ones(n, bool), np.ones(n, bool)
-    for _ in range(_MAX_SWEEPS):
+    for _ in range(n):
         after = 1 + np.flatnonzero(intervals.linked & forward[:-1] & _ends_well(fit.ends)[:-1])
         fit, losses, forward = _better(intervals, fit, losses, after, fit.ends[after - 1])
         backward |= forward
@@ -307,7 +380,7 @@ def minimise(
         step = gauss_newton_step(at, damping)
         intervals, damping, updated = step.intervals, step.damping, schedule.after(step)
         errors = np.sqrt(np.diag(step.solved.var_p)[: intervals.n_p])
-        converged = step.of_errors < _ERRORS_SETTLED and _unchanged(at.fit, updated, errors, schedule.settled)
+        converged = step.of_errors < _LOOSE * schedule.settled and _unchanged(at.fit, updated, errors, schedule.settled)
         if hopeless < np.inf:
             before, loss = loss, updated.noise.loss(updated.residuals, intervals.known)
             if loss - (limit - steps) * (before - loss) > hopeless:

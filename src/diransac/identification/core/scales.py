@@ -11,24 +11,18 @@ MacKay 1992 (evidence updates).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.normal_equations import innovation_std, innovations
-
-if TYPE_CHECKING:
-    from diransac.identification.methods.lo_diransac.arrowhead import Factored
-    from diransac.identification.methods.lo_diransac.normal_equations import Fit
-    from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
+from diransac.identification.core.arrowhead import Factored
+from diransac.identification.core.fit import Fit, innovation_std, innovations
+from diransac.identification.core.windows import ShootingIntervals
 
 SHRINK = 0.4
 """Largest change of any scale in a step."""
-
 CONTINUITY = 0.03
 """Jumps over the effect of tau in an interval: as small a part of it is exact for practical purposes."""
-
 # Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
 # the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01

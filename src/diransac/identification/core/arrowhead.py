@@ -192,6 +192,27 @@ class Arrowhead:
         again = (solved(*x).solved for x in zip(sections, left, reversed(ends), strict=True))
         return map(own, again if len(sections) > 1 else [last]), p
 
+    def eliminated(self, right_z: FloatArray, right_p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information and right-hand side of the last window and the shared unknowns, without the windows before it.
+
+        Parameters
+        ----------
+        right_z : (W, k) array
+        right_p : (m,) array
+
+        Returns
+        -------
+        (k + m, k + m) array, (k + m,) array
+        """
+        _, k, m = self.border.shape
+        columns = np.concatenate([np.zeros((len(self.border) - 1, k, k)), self.border[:-1], right_z[:-1, :, None]], 2)
+        columns[-1, :, :k] = self.below[-1].T
+        shift = self.ridge * _size(np.einsum("wii->wi", self.diagonal[:-1]))
+        solved = solve_blocks(self.diagonal[:-1], self.below[:-1], (columns,), shift).solved
+        taken = columns[:, :, :-1].reshape(-1, k + m).T @ solved.reshape(-1, k + m + 1)
+        own = np.block([[self.diagonal[-1], self.border[-1]], [self.border[-1].T, self.corner]])
+        return own - taken[:, :-1], np.concatenate([right_z[-1], right_p]) - taken[:, -1]
+
     def _solved(self, right_z: FloatArray, right_p: FloatArray, damping: float) -> Factored:
         """Solutions ``(W, k, c)`` and ``(m, c)`` for as many right-hand sides."""
         W, k, m = self.border.shape
