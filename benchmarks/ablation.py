@@ -89,7 +89,7 @@ def _parts() -> dict[str, Part]:
         "errors must explain forces": Part(
             patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
         ),
-        "screening": Part(replace(DEFAULT, stuck_rows=False)),
+        "screening": Part(patches=(("preparation.stuck_rows", lambda x: np.zeros(len(x), bool)),)),
         "robust loss of the projection": Part(patches=(("projection.CAUCHY", None),)),
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
         "least squares": _without_source("least squares"),

@@ -7,7 +7,7 @@ from accusation_machines import SCARA, slider, turret
 
 import diransac as dr
 from diransac.data.preprocessing import wrap_period
-from diransac.identification.methods.lo_diransac.screening import stuck_rows
+from diransac.identification.methods.lo_diransac.preparation import stuck_rows
 from diransac.identification.structure.column_corrections import Correction, with_factor_inside
 
 T = 0.01 * np.arange(4000)

@@ -28,13 +28,8 @@ from diransac.identification.methods.lo_diransac.motion_equations import (
     residuals_of_motion,
     unexplained,
 )
+from diransac.identification.methods.lo_diransac.preparation import stuck_rows
 from diransac.identification.methods.lo_diransac.projection import projected_candidates, projected_parameters
-from diransac.identification.methods.lo_diransac.screening import (
-    running_median,
-    screened_inputs,
-    stuck_rows,
-    without_spikes,
-)
 from diransac.identification.methods.lo_diransac.smoothing import Samples, choose_half_widths, smooth
 from diransac.text_table import duration
 from simulated import MACHINES, as_log, flight, rollout
@@ -59,7 +54,7 @@ def intervals_of(n_rows=200, length=25, dt=0.01):
 
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
-    samples = Samples(measured, known, running_median(measured, known, 31), np.zeros(len(measured), bool))
+    samples = Samples.of(measured, known, np.zeros(len(measured), bool), 25)
     return smooth(ROTORCRAFT, [samples], 0.01, np.full(9, 25))[0]
 
 
@@ -198,7 +193,7 @@ def samples_of(known: np.ndarray, wave, noise: float = 0.02) -> Samples:
     t = 0.01 * np.arange(len(known))
     measured = wave(t)[:, None] + noise * np.random.default_rng(6).normal(size=known.shape)
     measured = np.where(known, measured, 0.0)
-    return Samples(measured, known, running_median(measured, known, 31), ~known.any(axis=1))
+    return Samples.of(measured, known, ~known.any(axis=1), 25)
 
 
 def test_half_width_is_wider_where_the_motion_is_slower_and_narrower_where_it_is_faster():
@@ -654,29 +649,6 @@ def test_rows_that_repeat_because_signals_are_coarse_are_not_stuck():
     frozen[60:100] = frozen[59]
     assert stuck_rows(frozen)[60:100].all()
     assert not stuck_rows(frozen)[:50].any()
-
-
-def test_momentary_leaps_of_an_input_are_replaced_and_steps_are_not():
-    t = np.arange(300)
-    clean = np.column_stack([np.sin(0.05 * t), np.where(t // 40 % 2, 1.0, -1.0)])
-    spoilt = clean.copy()
-    spoilt[[50, 123], 0] = [500.0, -80.0]
-    screened, n = screened_inputs(spoilt, 15, 8.0)
-    assert n == 2
-    assert np.abs(screened - clean).max() < 0.1
-    assert np.array_equal(screened[:, 1], clean[:, 1])
-
-
-def test_spikes_within_the_range_of_an_input_are_replaced_where_its_noise_is_small():
-    rng, t = np.random.default_rng(3), np.arange(2000)
-    clean = np.column_stack([np.sin(0.01 * t), np.where(t // 40 % 2, 1.0, -1.0), rng.standard_normal(len(t))])
-    spoilt = clean + [0.01, 0.0, 0.0] * rng.standard_normal(clean.shape)
-    hit = rng.random(len(t)) < 0.05
-    spoilt[hit, 0] += rng.choice([-1.0, 1.0], hit.sum()) * rng.uniform(0.3, 1.0, hit.sum())
-    screened, n = without_spikes(spoilt, 8.0)
-    assert n == pytest.approx(hit.sum(), abs=3)
-    assert np.median(np.abs(screened - clean)[hit, 0]) < 0.02
-    assert np.array_equal(screened[:, 1:], spoilt[:, 1:])
 
 
 def test_spikes_of_a_force_leave_the_mass_whether_they_acted_or_not():

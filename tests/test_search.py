@@ -536,7 +536,8 @@ def test_near_misses_are_refitted_by_i_diransac_alone():
 
 
 def test_inlier_fraction_ends_i_diransac_alone():
-    assert IDiransac().is_finished(Score(1.0, 0.85), 0.85)
-    assert not IDiransac().is_finished(Score(1.0, 0.84), 0.85)
-    assert not IDiransac().is_finished(Score(1.0, 1.0), None)
-    assert not Diransac().is_finished(Score(1.0, 1.0), 0.85)
+    early = Settings(stop_inlier_fraction=0.85)
+    assert IDiransac(early).is_finished(Score(1.0, 0.85))
+    assert not IDiransac(early).is_finished(Score(1.0, 0.84))
+    assert not IDiransac(Settings(stop_inlier_fraction=None)).is_finished(Score(1.0, 1.0))
+    assert not Diransac().is_finished(Score(1.0, 1.0))

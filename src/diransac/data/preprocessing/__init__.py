@@ -13,7 +13,7 @@ Each step adds one mapping to ``Log.history`` and, where it changes samples, a s
 
 from diransac.data.preprocessing.continuity import continuous, continuous_quaternions, unwrap
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
-from diransac.data.preprocessing.spikes import despike, hampel, running_deviation
+from diransac.data.preprocessing.spikes import despike, hampel
 from diransac.data.preprocessing.steps import (
     in_units,
     keep_while,
@@ -41,7 +41,6 @@ __all__ = [
     "prepared",
     "rename",
     "resample",
-    "running_deviation",
     "scale",
     "shift",
     "unit_factors",

@@ -46,12 +46,7 @@ def despike(log: Log, signals: Sequence[str] | None = None, window: int = 15, th
     return log.with_step(step, signals=cleaned, notes=notes)
 
 
-def hampel(
-    values: FloatArray,
-    window: int = 15,
-    threshold: float = 8.0,
-    scale: Callable[[FloatArray, FloatArray, int], FloatArray] | None = None,
-) -> tuple[BoolArray, FloatArray]:
+def hampel(values: FloatArray, window: int = 15, threshold: float = 8.0) -> tuple[BoolArray, FloatArray]:
     """Outliers from the running median, ``|x - median| > threshold * scale``, and that median.
 
     Parameters
@@ -61,11 +56,7 @@ def hampel(
     window : int
         Samples around each that give its median, odd.
     threshold : float
-        In standard deviations.
-    scale : callable, optional
-        ``scale(values, median, window) -> (N, ...)`` standard deviation around each sample.  None: `window_deviation`,
-        for a signal ``(N,)`` of any kind, as in `despike`; the method ``lo-diransac`` screens inputs ``(N, n_u)`` with
-        `running_deviation`.
+        In standard deviations, by `window_deviation`.
 
     Returns
     -------
@@ -87,7 +78,7 @@ def hampel(
         )
     with np.errstate(invalid="ignore", over="ignore"):
         median = _running_median(values, window)
-        deviation = (scale or window_deviation)(values, median, window)
+        deviation = window_deviation(values, median, window)
         return np.asarray(np.abs(values - median) > threshold * deviation), median
 
 
@@ -105,15 +96,6 @@ def window_deviation(values: FloatArray, median: FloatArray, window: int) -> Flo
     scale = MAD_TO_STD * _of_finite(_middle, off)
     scale = np.where(scale > 0.0, scale, 1.2533 * _of_finite(np.mean, off))
     return np.asarray(np.maximum(scale, np.apply_along_axis(_count, 0, values)))
-
-
-def running_deviation(values: FloatArray, median: FloatArray, window: int) -> FloatArray:
-    """Standard deviation ``(N, ...)`` from the running median of ``|x - median|``, at least that of the whole signal.
-
-    Changes of the size that is usual over the whole signal, such as a controller's steps, are then no outliers.
-    """
-    whole = np.median(np.abs(values - np.median(values, axis=0)), axis=0)
-    return np.maximum(MAD_TO_STD * _running_median(np.abs(values - median), window), MAD_TO_STD * whole)
 
 
 def _running_median(values: FloatArray, window: int) -> FloatArray:

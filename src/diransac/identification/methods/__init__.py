@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 from diransac.errors import SettingsError, check_known
 from diransac.identification.settings import EXECUTION, Settings
@@ -26,28 +27,24 @@ __all__ = [
     "setting_names",
 ]  # fmt: skip
 
-_REGISTRY = {
-    "ols": "least_squares:ordinary",
-    "tls": "least_squares:total",
-    "nls": "least_squares:nonlinear",
-    "diransac": "ransac:Diransac",
-    "i-diransac": "ransac:IDiransac",
-    "lo-diransac": "lo_diransac:configured",
+ESTIMATORS = {
+    "ols": "regression.estimators:OrdinaryLeastSquares",
+    "tls": "regression.estimators:TotalLeastSquares",
+    "nls": "regression.nonlinear:NonlinearLeastSquares",
 }
-METHODS = tuple(_REGISTRY)
+"""Places of the estimators by name, those of the methods that fit all rows with them."""
+
+_SEARCHES = {
+    "diransac": "methods.ransac:Diransac",
+    "i-diransac": "methods.ransac:IDiransac",
+    "lo-diransac": "methods.lo_diransac:configured",
+}
+METHODS = (*ESTIMATORS, *_SEARCHES)
 """Names of all methods."""
 
 DEFAULT = "lo-diransac"
 WITH_ESTIMATOR = ("diransac", "i-diransac")
 """Names of the methods with an estimator inside."""
-
-_ESTIMATORS = {
-    "ols": "regression.estimators:OrdinaryLeastSquares",
-    "tls": "regression.estimators:TotalLeastSquares",
-    "nls": "regression.nonlinear:NonlinearLeastSquares",
-}
-ESTIMATORS = tuple(_ESTIMATORS)
-"""Names of these estimators, those of the methods that fit all rows with them."""
 
 
 def factory(name: str) -> Callable[..., Method]:
@@ -68,8 +65,9 @@ def factory(name: str) -> Callable[..., Method]:
         There is no method of that name; the message lists all.
     """
     check_known([name], METHODS, "there is no method", "there are")
-    found: Callable[..., Method] = _imported(f"methods.{_REGISTRY[name]}")
-    return found
+    if name in ESTIMATORS:
+        return partial(_imported("methods.least_squares:LeastSquares"), estimator_named(name))
+    return cast("Callable[..., Method]", _imported(_SEARCHES[name]))
 
 
 def estimator_named(name: str) -> object:
@@ -89,12 +87,12 @@ def estimator_named(name: str) -> object:
     SettingsError
         There is no estimator of that name; the message lists all.
     """
-    if name not in _ESTIMATORS:
+    if name not in ESTIMATORS:
         raise SettingsError(
             f"estimator is {name!r:.60}; give {', '.join(ESTIMATORS)}, an object such as dr.TotalLeastSquares(), or a "
             "scikit-learn linear regressor"
         )
-    return _imported(_ESTIMATORS[name])()
+    return _imported(ESTIMATORS[name])()
 
 
 def _imported(place: str) -> Any:
@@ -115,7 +113,7 @@ def default_options(name: str) -> Mapping[str, Any]:
     -------
     mapping of str to object
     """
-    return factory(name)(Settings()).options() if name in _REGISTRY else {}
+    return factory(name)(Settings()).options() if name in METHODS else {}
 
 
 def setting_names(name: str) -> tuple[str, ...]:

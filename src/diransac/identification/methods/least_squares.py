@@ -11,12 +11,7 @@ from diransac.errors import IdentificationError
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.estimate import Estimate
 from diransac.identification.method import report
-from diransac.identification.regression.estimators import (
-    BoundEstimator,
-    Estimator,
-    OrdinaryLeastSquares,
-    TotalLeastSquares,
-)
+from diransac.identification.regression.estimators import BoundEstimator, Estimator, OrdinaryLeastSquares
 from diransac.identification.regression.nonlinear import BoundNonlinear, NonlinearLeastSquares
 from diransac.identification.regression.rows import motion_rows
 from diransac.identification.regression.scikit_learn import as_estimator, name_of
@@ -65,9 +60,8 @@ class LeastSquares:
     @property
     def name(self) -> str:
         """``"ols"``, ``"tls"``, ``"nls"``, or the name of the estimator's class."""
-        known = name_of(self._estimator)
         names = {"OrdinaryLeastSquares": "ols", "TotalLeastSquares": "tls", "NonlinearLeastSquares": "nls"}
-        return names.get(known, known)
+        return names.get(name_of(self._estimator), name_of(self._estimator))
 
     @property
     def _estimator(self) -> Estimator:
@@ -110,21 +104,6 @@ class LeastSquares:
         report(callback, "uncertainty", 0.5)
         resolution = Resolution(self.criteria.integrator, self.criteria.substeps, dataset.hold)
         return fitted(bound, dataset, parameters, rows, estimator=name_of(self._estimator), resolution=resolution)
-
-
-def ordinary(settings: Settings) -> LeastSquares:
-    """Method "ols"."""
-    return LeastSquares(OrdinaryLeastSquares(), settings)
-
-
-def total(settings: Settings) -> LeastSquares:
-    """Method "tls"."""
-    return LeastSquares(TotalLeastSquares(), settings)
-
-
-def nonlinear(settings: Settings) -> LeastSquares:
-    """Method "nls"."""
-    return LeastSquares(NonlinearLeastSquares(), settings)
 
 
 def bound_to(estimator: Estimator, dataset: Dataset) -> BoundEstimator:

@@ -7,7 +7,6 @@ The answer is that of the sequential algorithm, whatever the batch size.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -36,16 +35,16 @@ if TYPE_CHECKING:
     from diransac.identification.regression.estimators import BoundEstimator
     from diransac.model import Model
 
+# Reason for the rejection of a hypothesis that fails the preliminary test.
 _OUT_OF_BOUNDS = "out of bounds"
-_SEARCH = ("sample_size", "max_iterations", "refit")
 
 
 # ---------------------------------------------------------------------- variants
 
 
 @dataclass(frozen=True)
-class RansacMethod(ABC):
-    """Algorithm 1; variants differ in which hypotheses improve, are stored, are refitted, and end the search.
+class Diransac:
+    """DIRANSAC, the predecessor: the smallest mean squared error is stored and refitted, up to the iteration limit.
 
     Parameters
     ----------
@@ -59,18 +58,24 @@ class RansacMethod(ABC):
     ------
     SettingsError
         A setting is not used by the method, or the estimator is not an estimator.
+
+    References
+    ----------
+    Dimmig et al. 2023, section III, on its reference [22].
     """
 
     criteria: Settings = field(default_factory=Settings)
     estimator: object = None
 
-    name: ClassVar[str]
-    uses: ClassVar[tuple[str, ...]]
-    squared_error: ClassVar[bool]
-    needs_all_signals = True
+    name: ClassVar[str] = "diransac"
+    uses: ClassVar[tuple[str, ...]] = ("sample_size", "max_iterations", "refit", *JUDGING, *SIMULATION)
+    squared_error: ClassVar[bool] = True
+    needs_all_signals: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_used(self.criteria, self.uses, self.name)
+        # A search that never ends early is what stop_inlier_fraction = None says.
+        early = () if self.criteria.stop_inlier_fraction else ("stop_inlier_fraction",)
+        check_used(self.criteria, (*self.uses, *early), self.name)
         if self.estimator is not None:
             as_estimator(self.estimator)
 
@@ -108,30 +113,28 @@ class RansacMethod(ABC):
                 f"{settings.sample_size}; give a longer log or a smaller sample_size"
             )
         try:
-            found = search(self, self._samples(bound, dataset, int(seed)), callback)
+            state = search(self, self._samples(bound, dataset, int(seed)), callback)
         except NothingAcceptedError as error:
             if set(error.rejected) != {_OUT_OF_BOUNDS}:
                 raise
             cause = cause_of_refusal(dataset.model, dataset.layout, motion_rows(dataset))
             raise IdentificationError(f"{dataset.source}: {error.counts}: {cause}") from error
-        assert found.best is not None
+        assert state.best is not None
         return fitted(
-            bound,
-            dataset,
-            found.best.parameters,
-            np.sort(found.best.rows),
-            estimator=name_of(estimator),
+            bound, dataset, state.best.parameters, np.sort(state.best.rows), estimator=name_of(estimator),
             resolution=Resolution(settings.integrator, settings.substeps, dataset.hold),
-            squared_error=self.squared_error,
-            iterations=found.iterations,
-            n_hypotheses=found.n_hypotheses,
-            stop_reason=found.stop_reason,
-            rejected=dict(found.rejected),
-        )
+            squared_error=self.squared_error, iterations=state.iterations, n_hypotheses=state.n_hypotheses,
+            stop_reason=state.stop_reason, rejected=dict(state.rejected),
+        )  # fmt: skip
 
     def regresses(self, model: Model) -> bool:
         """True unless the estimator is nonlinear."""
         return not isinstance(self._estimator(model), NonlinearLeastSquares)
+
+    def _estimator(self, model: Model) -> Estimator:
+        if self.estimator is not None:
+            return as_estimator(self.estimator)
+        return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
 
     def _samples(self, bound: BoundEstimator, dataset: Dataset, seed: int) -> Samples:
         """Samples of the dataset, which methods that draw, fit and simulate them alike share."""
@@ -144,30 +147,25 @@ class RansacMethod(ABC):
         alike = [getattr(settings, name) for name in ("sample_size", *JUDGING, *SIMULATION)]
         return dataset.kept((Samples, bound, seed, alike), make)
 
-    def _estimator(self, model: Model) -> Estimator:
-        if self.estimator is not None:
-            return as_estimator(self.estimator)
-        return NonlinearLeastSquares() if model.nonlinear_parameters else OrdinaryLeastSquares()
-
-    @abstractmethod
     def improves(self, new: Score, best: Score) -> bool:
-        """Condition under which a hypothesis is considered further (Algorithm 1, line 19)."""
+        """Condition under which a hypothesis is considered further (Algorithm 1, line 19): less error."""
+        return new.error < best.error
 
-    @abstractmethod
     def accepts(self, new: Score, best: Score) -> bool:
-        """Condition under which an improving hypothesis is stored (line 20)."""
+        """Condition under which an improving hypothesis is stored (line 20): always."""
+        return True
 
-    @abstractmethod
     def refits(self, *, stored: bool) -> bool:
-        """Condition under which an improving hypothesis is refitted to its inliers (lines 25-31)."""
+        """Condition under which an improving hypothesis is refitted to its inliers (lines 25-31): it was stored."""
+        return stored
 
-    @abstractmethod
-    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
-        """Condition under which the stored hypothesis ends the search early (line 3)."""
+    def is_finished(self, best: Score) -> bool:
+        """Condition under which the stored hypothesis ends the search early (line 3): never."""
+        return False
 
 
 @dataclass(frozen=True)
-class IDiransac(RansacMethod):
+class IDiransac(Diransac):
     """I-DIRANSAC: RMS error, eq. (3), a refit of the inliers of every improving hypothesis, a stop by inlier fraction.
 
     References
@@ -176,7 +174,7 @@ class IDiransac(RansacMethod):
     """
 
     name = "i-diransac"
-    uses = (*_SEARCH, "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
+    uses = (*Diransac.uses[:3], "stop_inlier_fraction", "acceptance_weights", *JUDGING, *SIMULATION)
     squared_error = False
 
     def improves(self, new: Score, best: Score) -> bool:
@@ -201,44 +199,10 @@ class IDiransac(RansacMethod):
         """Always: improving hypotheses that were not stored, too."""
         return True
 
-    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
+    def is_finished(self, best: Score) -> bool:
         """The stored fraction of inliers has reached the threshold."""
-        return stop_inlier_fraction is not None and best.inlier_fraction >= stop_inlier_fraction
-
-
-@dataclass(frozen=True)
-class Diransac(RansacMethod):
-    """DIRANSAC, the predecessor: the smallest mean squared error is stored and refitted, up to the iteration limit.
-
-    References
-    ----------
-    Dimmig et al. 2023, section III, on its reference [22].
-    """
-
-    name = "diransac"
-    uses = (*_SEARCH, *JUDGING, *SIMULATION)
-    squared_error = True
-
-    def __post_init__(self) -> None:
-        # It never ends early, which is what stop_inlier_fraction = None says.
-        early = () if self.criteria.stop_inlier_fraction else ("stop_inlier_fraction",)
-        check_used(self.criteria, (*self.uses, *early), self.name)
-
-    def improves(self, new: Score, best: Score) -> bool:
-        """Less error; inliers play no part."""
-        return new.error < best.error
-
-    def accepts(self, new: Score, best: Score) -> bool:
-        """Always: whatever improves is stored."""
-        return True
-
-    def refits(self, *, stored: bool) -> bool:
-        """Only of what was stored."""
-        return stored
-
-    def is_finished(self, best: Score, stop_inlier_fraction: float | None) -> bool:
-        """Never early."""
-        return False
+        threshold = self.criteria.stop_inlier_fraction
+        return threshold is not None and best.inlier_fraction >= threshold
 
 
 # ---------------------------------------------------------------------- the search
@@ -277,11 +241,6 @@ class SearchState:
 class NothingAcceptedError(IdentificationError):
     """No hypothesis of a search was accepted.
 
-    Parameters
-    ----------
-    state : SearchState
-        State at the end of the search.
-
     Attributes
     ----------
     rejected : mapping of str to int
@@ -300,12 +259,12 @@ class NothingAcceptedError(IdentificationError):
         )
 
 
-def search(variant: RansacMethod, samples: Samples, callback: Callback | None = None) -> SearchState:
+def search(variant: Diransac, samples: Samples, callback: Callback | None = None) -> SearchState:
     """State at the end of Algorithm 1 in the given variant.
 
     Parameters
     ----------
-    variant : RansacMethod
+    variant : Diransac
     samples : Samples
         Random samples, and refits to inliers.
     callback : callable, optional
@@ -328,20 +287,20 @@ def search(variant: RansacMethod, samples: Samples, callback: Callback | None = 
     ----------
     Dimmig et al. 2023, Algorithm 1.
     """
-    settings, state = variant.criteria, SearchState()
+    state = SearchState()
     try:
-        for iterations in _batches(settings):
+        for iterations in _batches(variant.criteria):
             batch = samples.batch(iterations)
             for i, score in enumerate(batch.scores(squared_error=variant.squared_error)):
                 check_time()
                 state.iterations += 1
                 if _improves(score, state, variant):
                     _follow(batch.hypothesis(i, score), state, variant, samples)
-                    if variant.is_finished(state.score, settings.stop_inlier_fraction):
+                    if variant.is_finished(state.score):
                         break
-            fraction = state.iterations / settings.max_iterations
+            fraction = state.iterations / variant.criteria.max_iterations
             report(callback, "searching", fraction, f"{state.score.inlier_fraction:.0%} inliers")
-            if variant.is_finished(state.score, settings.stop_inlier_fraction):
+            if variant.is_finished(state.score):
                 break
     except TimeLimitError:
         if state.best is None:
@@ -350,22 +309,20 @@ def search(variant: RansacMethod, samples: Samples, callback: Callback | None = 
         return state
     if state.best is None:
         raise NothingAcceptedError(state)
-    finished = variant.is_finished(state.score, settings.stop_inlier_fraction)
+    finished = variant.is_finished(state.score)
     state.stop_reason = "inlier fraction reached" if finished else "iteration limit reached"
     return state
 
 
 def _batches(settings: Settings) -> Iterator[range]:
     """Iterations in batches, which grow from 16 to ``batch_size`` where the search may stop early."""
-    may_stop = settings.stop_inlier_fraction is not None
-    start, size = 0, min(16, settings.batch_size) if may_stop else settings.batch_size
+    start, size = 0, settings.batch_size if settings.stop_inlier_fraction is None else min(16, settings.batch_size)
     while start < settings.max_iterations:
-        stop = min(start + size, settings.max_iterations)
-        yield range(start, stop)
-        start, size = stop, min(2 * size, settings.batch_size)
+        yield range(start, min(start + size, settings.max_iterations))
+        start, size = start + size, min(2 * size, settings.batch_size)
 
 
-def _improves(score: Score | None, state: SearchState, variant: RansacMethod) -> TypeGuard[Score]:
+def _improves(score: Score | None, state: SearchState, variant: Diransac) -> TypeGuard[Score]:
     """True if a hypothesis improves (line 19); otherwise it is rejected, None because of the preliminary test."""
     state.n_hypotheses += 1
     if score is not None and variant.improves(score, state.score):
@@ -379,7 +336,7 @@ def _reason(score: Score, otherwise: str) -> str:
     return "diverged" if score.error == np.inf else otherwise
 
 
-def _follow(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod, samples: Samples) -> None:
+def _follow(hypothesis: Hypothesis, state: SearchState, variant: Diransac, samples: Samples) -> None:
     """Acceptance of an improving hypothesis, and of those in the chain of refits that it starts (lines 20-34)."""
     settings, n_rows = variant.criteria, samples.estimator.n_rows
     used: set[bytes] = set()
@@ -394,7 +351,7 @@ def _follow(hypothesis: Hypothesis, state: SearchState, variant: RansacMethod, s
         used.add(fingerprint(hypothesis.rows, n_rows))
         inliers = hypothesis.batch.inliers(hypothesis.lane)
         limit = state.iterations >= settings.max_iterations
-        if limit or variant.is_finished(state.score, settings.stop_inlier_fraction):
+        if limit or variant.is_finished(state.score):
             return
         if fingerprint(inliers, n_rows) in used or (refitted := samples.refit(inliers)) is None:
             return

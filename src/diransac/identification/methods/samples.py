@@ -141,27 +141,26 @@ class FittedSamples:
         Usable rows of each sample.
     parameters : (n_samples, n) array
         Each in its unit.
-    lanes : list of int or None
-        Place of each sample in the scored batch; None where it fails the preliminary test.
+    admitted : (n_samples,) bool array
+        Samples that pass the preliminary test; their places in the scored batch are in the same order.
     scored : ScoredBatch, optional
         None where all of them fail it.
     """
 
     samples: list[IntArray]
     parameters: FloatArray
-    lanes: list[int | None]
+    admitted: BoolArray
     scored: ScoredBatch | None
 
     def scores(self, *, squared_error: bool) -> list[Score | None]:
         """The score of every sample, None where it fails the preliminary test."""
-        scores = [] if self.scored is None else self.scored.scores(squared_error=squared_error)
-        return [None if lane is None else scores[lane] for lane in self.lanes]
+        scores = iter([] if self.scored is None else self.scored.scores(squared_error=squared_error))
+        return [next(scores) if admitted else None for admitted in self.admitted]
 
     def hypothesis(self, i: int, score: Score) -> Hypothesis:
         """The hypothesis of a sample that passes the preliminary test."""
-        lane = self.lanes[i]
         assert self.scored is not None
-        assert lane is not None
+        lane = int(self.admitted[:i].sum())
         return Hypothesis(self.parameters[i], self.samples[i], score, self.scored, lane)
 
 
@@ -226,10 +225,8 @@ class Samples:
     def _scored(self, samples: list[IntArray], parameters: FloatArray) -> FittedSamples:
         """Samples with their parameters ``(n_samples, n)``, and the scores of those that are admitted."""
         admitted = self._evaluator.admits(parameters)
-        lanes = (np.cumsum(admitted) - 1).tolist()
-        places = [lane if good else None for lane, good in zip(lanes, admitted.tolist(), strict=True)]
         scored = self._evaluator.score(parameters[admitted]) if admitted.any() else None
-        return FittedSamples(samples, parameters, places, scored)
+        return FittedSamples(samples, parameters, admitted, scored)
 
     def _grown(self, sample: IntArray, k: IntArray) -> IntArray:
         """The sample with as many more random observations as make it well-defined (lines 6-10).

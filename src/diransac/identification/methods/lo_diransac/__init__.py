@@ -7,7 +7,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 |---|---|
 | `method.py`, `settings.py` | `LoDiransac`: the steps in their order; settings, checked |
 | **the logs** | |
-| `preparation.py`, `screening.py` | logs in intervals; samples and inputs that are left out |
+| `preparation.py` | logs in intervals; rows that are left out |
 | `smoothing.py`, `unmeasured.py` | the motion without a model; states that no signal measures |
 | **the search** | |
 | `search.py`, `hypotheses.py` | the likeliest explanation; samples in weak form, consensus |

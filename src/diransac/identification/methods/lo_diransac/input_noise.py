@@ -12,12 +12,13 @@ Fuller 1987 (errors in variables).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray
+from diransac.arrays import FloatArray, size_or_one
 from diransac.data.input_timing import acting_inputs
 from diransac.identification.core.equations import linearize
 from diransac.identification.core.fit import split, weights_of, with_residuals
@@ -37,21 +38,26 @@ if TYPE_CHECKING:
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.structure.candidate_terms import TermLibrary
 
-# Noise of an input, over its RMS: with which a fit starts, and what counts as none.
-_START, _NONE = 0.03, 1e-4
-# Numbers that normal matrices of all intervals have at most: 160 MB.
+# Noise of an input over its RMS with which a fit starts.
+_START = 0.03
+# Noise of an input over its RMS that counts as none.
+_NONE = 1e-4
+# Numbers in the normal matrices of all intervals, at most: 160 MB.
 _MOST = 2e7
-# Samples over which the response of an acting input to one that was recorded is summed.
+# Samples over which the response of an acting input to a recorded one is summed.
 _RESPONSE = 401
-# Part of a signal's samples that a fit takes at most.
-_MOST_TAKEN, _TINY = 0.995, 1e-300
-# Power at low frequencies, and fourth moments, over those of white noise, from which on noise is none.
+# Share of a signal's samples that a fit takes, at most.
+_MOST_TAKEN = 0.995
+# Power at low frequencies, and fourth moments, over those of white noise, from which on an error is no noise.
 _WHITE = 2.0
-# Stretches of a log that tell power at low frequencies; part of errors that are determined, from which on others show.
-_STRETCHES, _SEEN = 30, 0.1
-# Unmodelled accelerations are tried as noise of inputs: of an exact model from so many standard errors of their size,
-# of others below a correlation from interval to interval.
-_CLEAR, _SLOW = 3.0, 0.5
+# Stretches of a log whose sums show power at low frequencies.
+_STRETCHES = 30
+# Share of errors that the measurements determine, from which on they show whether they are white.
+_SEEN = 0.1
+# Standard errors of their size from which on accelerations that an exact model leaves may be noise of inputs.
+_CLEAR = 3.0
+# Correlation from interval to interval below which those that a flexible model leaves may be.
+_SLOW = 0.5
 
 
 def refine_noisy(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
@@ -83,15 +89,14 @@ def refine_noisy(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
 
 def _sizes(intervals: ShootingIntervals) -> FloatArray:
     """RMS ``(n_u,)`` of each input; 1 of one that never acts."""
-    found = np.sqrt(np.square(intervals.recorded).mean(axis=0))
-    return np.where(found > 0.0, found, 1.0)
+    return size_or_one(np.sqrt(np.square(intervals.recorded).mean(axis=0)))
 
 
 def _with_errors(intervals: ShootingIntervals, fit: Fit) -> tuple[ShootingIntervals, Fit]:
     """The intervals, split, and the fit with errors of inputs instead of unmodelled accelerations; all vanish yet."""
     n = fit.x.shape[1] + intervals.model.n_u + intervals.n_p
-    possible = [k for k in range(1, intervals.length + 1) if intervals.length % k == 0]
-    parts = max((k for k in possible if k * len(intervals) * n**2 < _MOST), default=1)
+    divisors = [k for k in range(1, intervals.length + 1) if intervals.length % k == 0]
+    parts = max((k for k in divisors if k * len(intervals) * n**2 < _MOST), default=1)
     finer, fit = split(intervals, fit, parts)
     finer, own = replace(finer, noisy=True, discrepancies=False), slice(intervals.n_p)
     tau = _START * _sizes(intervals) / np.sqrt(finer.length)
@@ -141,8 +146,8 @@ def _noise_sums(taken: Step) -> NoiseSums:
         slopes = intervals.gauss_newton(fit.shared, fit.x, fit.d, own).normal_matrix[:, :k, :k]
         moved = np.einsum("wim,mn,wjn->wij", solved.gain, solved.var_p, solved.gain, optimize=True)
         variances[i] = (slopes * (solved.alone + moved)).sum()
-    taken_up = np.minimum(variances / np.square(fit.noise.sigma), _MOST_TAKEN * sums.weight)
-    return replace(sums, squares=sums.squares * sums.weight / np.maximum(sums.weight - taken_up, _TINY))
+    share = np.minimum(variances / np.square(fit.noise.sigma) / size_or_one(sums.weight), _MOST_TAKEN)
+    return replace(sums, squares=sums.squares / (1.0 - share))
 
 
 def noise_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
@@ -155,28 +160,23 @@ def noise_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     """
     if not intervals.noisy:
         return np.zeros(intervals.model.n_u)
-    found = fit.tau * np.sqrt(intervals.length)
-    return np.where(found > 2.0 * _NONE * _sizes(intervals), found, 0.0)
+    noise = fit.tau * np.sqrt(intervals.length)
+    return np.where(noise > 2.0 * _NONE * _sizes(intervals), noise, 0.0)
 
 
 def averaged_noise(intervals: ShootingIntervals, fit: Fit) -> float:
     """Negative log evidence by which noise is less likely as it was recorded than as it acts; 0 without noise, nats.
 
-    A lag, a fraction of a sample by which a held input is late, and interpolation average the noise of samples.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    fit : Fit
-        At its optimum.
+    A lag, a fraction of a sample by which a held input is late, and interpolation average the noise of samples.  The
+    fit is at its optimum.
     """
     if not intervals.noisy:
         return 0.0
-    at, errors = linearize(intervals, fit, weights_of(intervals, fit)), intervals.all_errors
+    at, errors, n_u = linearize(intervals, fit, weights_of(intervals, fit)), intervals.all_errors, len(fit.tau)
     left = at.system.solve(at.right_z, at.right_s).var_z[:, fit.x.shape[1] :] / np.square(fit.tau)
-    n = _RESPONSE
-    impulse = np.repeat(np.eye(n)[:, n // 2, None], len(fit.tau), axis=1)
-    acting = acting_inputs(impulse, errors.input_delay, errors.input_lag, np.zeros(len(fit.tau)), intervals.hold, n)
+    impulse = np.zeros((_RESPONSE, n_u))
+    impulse[_RESPONSE // 2] = 1.0
+    acting = acting_inputs(impulse, errors.input_delay, errors.input_lag, np.zeros(n_u), intervals.hold, _RESPONSE)
     if intervals.hold != "zero-order":
         acting = 0.5 * (acting[1:] + acting[:-1])
     power = np.square(acting).sum(axis=0) / np.square(acting.sum(axis=0))
@@ -197,19 +197,17 @@ def simpler_timings(intervals: ShootingIntervals, *, free_hold: bool) -> list[Sh
     list of ShootingIntervals
         Those that differ.
     """
-    errors = intervals.all_errors
-    common = {x: y for x, y in errors.sizes.items() if not x.of_inputs or x == intervals.all_inputs(x.what)}
-    common = {x: y for x, y in common.items() if not (x.of_inputs and x.what == "drift")}
-    late, whole = dict[ErrorKind, float](), {x: y for x, y in errors.sizes.items() if not x.of_inputs}
-    for kind, size in errors.sizes.items():
-        if kind.of_inputs and kind.what != "drift":
-            delay = replace(kind, what="delay")
-            late[delay] = late.get(delay, 0.0) + size
-    whole |= {x: float(np.round(y)) for x, y in late.items() if np.round(y)}
+    sizes, late = intervals.all_errors.sizes, defaultdict[ErrorKind, float](float)
+    timings = [kind for kind in sizes if kind.of_inputs and kind.what != "drift"]
+    for kind in timings:
+        late[replace(kind, what="delay")] += sizes[kind]
+    of_sensors = {kind: size for kind, size in sizes.items() if not kind.of_inputs}
+    common = of_sensors | {kind: sizes[kind] for kind in timings if kind == intervals.all_inputs(kind.what)}
+    whole = of_sensors | {kind: float(np.round(size)) for kind, size in late.items() if np.round(size)}
     hold = "zero-order" if free_hold else intervals.hold
-    found = [(common, intervals.hold), (whole, hold)]
-    differs = [x for k, x in enumerate(found) if x not in ((errors.sizes, intervals.hold), *found[:k])]
-    return [replace(intervals, errors=replace(errors, sizes=sizes), hold=hold) for sizes, hold in differs]
+    simpler = [(common, intervals.hold), (whole, hold)]
+    differs = [x for k, x in enumerate(simpler) if x not in ((sizes, intervals.hold), *simpler[:k])]
+    return [replace(intervals, errors=replace(intervals.all_errors, sizes=x), hold=hold) for x, hold in differs]
 
 
 def may_explain(intervals: ShootingIntervals, fit: Fit, prior: Prior, projected: FloatArray | None) -> bool:
@@ -227,8 +225,8 @@ def may_explain(intervals: ShootingIntervals, fit: Fit, prior: Prior, projected:
     if not intervals.model.n_u:
         return False
     if projected is not None:
-        left = unexplained(intervals, fit, projected)
-        alike = (left[1:] * left[:-1]).sum(axis=0) < _SLOW * np.square(left).sum(axis=0)
+        rest = unexplained(intervals, fit, projected)
+        alike = (rest[1:] * rest[:-1]).sum(axis=0) < _SLOW * np.square(rest).sum(axis=0)
         return bool(alike.any() or (fit.rho < _SLOW)[fit.tau > prior.tau].any())
     fit = replace(fit, tau=prior.tau, rho=np.zeros_like(fit.rho))
     at = linearize(intervals, fit, weights_of(intervals, fit))

@@ -70,14 +70,6 @@ class LoDiransac(LoDiransacSettings):
     ----------
     criteria : Settings, optional
         Settings of the evaluation: weights, thresholds and initial state, threads.
-    stuck_rows : bool, optional
-        Whether rows that repeat the row before in every signal are taken as missing.
-    input_window : float, optional
-        Window of the Hampel filter that replaces momentary leaps of inputs, s; at most 15 samples.
-    input_threshold : float, optional
-        Threshold of the Hampel filter, in local standard deviations.
-    median_window : float, optional
-        Window of the running median from which smoothing starts, s; at most 31 samples.
     smoothing_half_width : float, optional
         Usual half width of the smoothing polynomials and length of the shooting intervals, s; at most 25 samples.
         Cross-validation chooses between it and three, nine, ... times its value, for smoothing also a third of it;

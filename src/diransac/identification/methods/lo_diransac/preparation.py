@@ -1,4 +1,4 @@
-"""Logs in shooting intervals, with screened inputs, and their smoothed motion."""
+"""Logs in shooting intervals, and their smoothed motion; rows that repeat the row before are missing samples."""
 
 from __future__ import annotations
 
@@ -7,16 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import FloatArray, long_runs
+from diransac.arrays import BoolArray, FloatArray, long_runs, robust_std, runs
 from diransac.data.segment import silent_rows
 from diransac.errors import LogError
 from diransac.identification.core.windows import ShootingIntervals
-from diransac.identification.methods.lo_diransac.screening import (
-    odd_window,
-    running_median,
-    screened_inputs,
-    stuck_rows,
-)
 from diransac.identification.methods.lo_diransac.smoothing import Motion, Samples, choose_half_widths, smooth
 from diransac.simulation import default_threads
 
@@ -30,40 +24,17 @@ if TYPE_CHECKING:
 FEWEST_INTERVALS = 4
 """Intervals of all logs at least, and of one that is compared with the others."""
 
-_MOST_INPUTS, _MOST_SAMPLES = 15, 31
-"""Samples of running medians at most: spikes last for samples, however many of them there are in a second."""
-
 
 def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
-    """The logs in intervals of the motion's own time scale, and the motion, row by row of them.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    dataset : Dataset
-
-    Returns
-    -------
-    intervals : ShootingIntervals
-        Inputs are screened, and act as recorded.
-    motion : Motion
-    notes : tuple of str
+    """The logs in intervals of the motion's own time scale, the motion in their rows, and notes.
 
     Raises
     ------
     LogError
         The logs are too short.
     """
-    model, dt = dataset.model, dataset.dt
-    found = [screened(settings, one, dt) for one in dataset.segments]
-    samples = [x for x, _, _ in found]
-    several = len(samples) > 1
-    notes = [
-        f"{one.log.source}: {note}" if several else note
-        for one, (_, _, said) in zip(dataset.segments, found, strict=True)
-        for note in said
-    ]
-    halves, length = choose_half_widths(model, samples, dt, settings.smoothing_half_width)
+    samples, notes = screened(settings, dataset)
+    halves, length = choose_half_widths(dataset.model, samples, dataset.dt, settings.smoothing_half_width)
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
     if n_rows < FEWEST_INTERVALS * length or longest < length:
         raise LogError(
@@ -75,65 +46,89 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
             f"{dataset.source}: no {length} rows in a row are without a gap in the inputs or in all sensors; give a "
             "log with longer stretches"
         )
-    motions = smooth(model, samples, dt, halves)
-    intervals = cut(settings, dataset, found, length)
-    rows = zip(motions, intervals.rows_of_logs, strict=True)
-    signals = np.concatenate([_to_length(x.signals, r.stop - r.start) for x, r in rows])
-    return intervals, Motion(signals, motions[0].spread), tuple(notes)
+    motions = smooth(dataset.model, samples, dataset.dt, halves)
+    intervals = cut(settings, dataset, samples, length)
+    missing = [r.stop - r.start - len(x.signals) for x, r in zip(motions, intervals.rows_of_logs, strict=True)]
+    signals = [np.pad(x.signals, ((0, n), (0, 0)), mode="edge") for x, n in zip(motions, missing, strict=True)]
+    return intervals, Motion(np.concatenate(signals), motions[0].spread), notes
 
 
-def cut(
-    settings: LoDiransacSettings,
-    dataset: Dataset,
-    samples: Sequence[tuple[Samples, FloatArray, list[str]]],
-    length: int,
-) -> ShootingIntervals:
-    """Intervals of the logs.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    dataset : Dataset
-    samples : sequence of (Samples, (N, n_u) array, list of str)
-        Of each log, as from `screened`.
-    length : int
-        Rows of an interval.
-    """
-    logs = [(x.measured, x.known, u, x.gaps) for x, u, _ in samples]
-    found = ShootingIntervals.of(
+def cut(settings: LoDiransacSettings, dataset: Dataset, samples: Sequence[Samples], length: int) -> ShootingIntervals:
+    """Intervals of ``length`` rows, of the samples of each log."""
+    logs = [(x.measured, x.known, log.inputs, x.gaps) for x, log in zip(samples, dataset.segments, strict=True)]
+    intervals = ShootingIntervals.of(
         dataset.model, dataset.layout, logs, dataset.dt, length, settings.substeps, dataset.hold
     )
-    return replace(found, threads=settings.criteria.threads or default_threads())
+    return replace(intervals, threads=settings.criteria.threads or default_threads())
 
 
-def _to_length(values: FloatArray, n_rows: int) -> FloatArray:
-    return np.pad(values, ((0, n_rows - len(values)), (0, 0)), mode="edge")
+def screened(settings: LoDiransacSettings, dataset: Dataset) -> tuple[list[Samples], tuple[str, ...]]:
+    """Samples of each log without rows that are stuck, and a note on each log that has some."""
+    samples, notes = [], []
+    for log in dataset.segments:
+        stuck = stuck_rows(log.measured[:, [log.signals.index(name) for name in log.present]])
+        samples.append(_samples(log, stuck, dataset.dt, settings.smoothing_half_width))
+        if stuck.any():
+            source = f"{log.log.source}: " if len(dataset.segments) > 1 else ""
+            notes.append(f"{source}{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
+    return samples, tuple(notes)
 
 
-def screened(settings: LoDiransacSettings, one: Segment, dt: float) -> tuple[Samples, FloatArray, list[str]]:
-    """Samples and inputs of one log, and findings, a sentence each.
+def _samples(log: Segment, stuck: BoolArray, dt: float, half_width: float) -> Samples:
+    """Samples of a log in the model's order of signals."""
+    order = list(log.model.signals)
+    measured = np.full((len(log), len(order)), np.nan)
+    measured[:, [order.index(name) for name in log.signals]] = log.measured
+    known = np.isfinite(measured) & ~stuck[:, None]
+    return Samples.of(np.where(known, measured, 0.0), known, log.gaps | silent_rows(known, dt), half_width / dt)
+
+
+def stuck_rows(measured: FloatArray) -> BoolArray:
+    """Rows that repeat the previous row exactly in every signal, and are no standing still: nothing new was measured.
+
+    Rows that repeat more often than the noise of the signals, in steps of their resolution, lets them by chance are
+    stuck.  Signals of a coarse resolution repeat at rest.  Rows are at rest if motion then begins from rest in each
+    signal, with a step that is no larger than the one that follows, or one of its resolution, within the noise; a
+    recorder that was stuck catches up.
 
     Parameters
     ----------
-    settings : LoDiransacSettings
-    one : Segment
-    dt : float
-        Sampling time, s.
+    measured : (N, n) array
+
+    Returns
+    -------
+    (N,) bool array
     """
-    model, notes, measured = one.model, [], one.measured
-    if one.signals != tuple(model.signals):
-        measured = np.full((len(one), len(model.signals)), np.nan)
-        measured[:, [model.signals.index(n) for n in one.signals]] = one.measured
-    present = [one.signals.index(n) for n in one.present]
-    stuck = stuck_rows(one.measured[:, present]) if settings.stuck_rows else np.zeros(len(one), bool)
-    known = np.isfinite(measured) & ~stuck[:, None]
-    measured = measured if known.all() else np.where(known, measured, 0.0)
-    inputs, n_leaps = screened_inputs(
-        one.inputs, odd_window(settings.input_window, dt, _MOST_INPUTS), settings.input_threshold
-    )
-    if stuck.any():
-        notes.append(f"{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
-    if n_leaps:
-        notes.append(f"inputs leap for a moment in {n_leaps} rows; the running median replaces them")
-    centre = running_median(measured, known, odd_window(settings.median_window, dt, _MOST_SAMPLES))
-    return Samples(measured, known, centre, one.gaps | silent_rows(known, dt)), inputs, notes
+    last, repeated = len(measured) - 1, np.zeros(len(measured), bool)
+    repeated[1:] = np.all(measured[1:] == measured[:-1], axis=1)
+    if not repeated.any():
+        return repeated
+    resolution, noise = _resolutions(measured), _noise(measured[~repeated])
+    # Two samples with noise are equal, in steps of the resolution, with this probability.
+    chance = np.divide(resolution, 2.0 * np.sqrt(np.pi) * noise, out=np.ones_like(noise), where=noise > resolution)
+    begin, end = np.array([(run.start, run.stop) for run in runs(repeated)]).T
+    ahead, further = (np.minimum(rows, last) for rows in (end, end + 1))
+    leap, step = np.abs(measured[ahead] - measured[begin]), np.abs(measured[further] - measured[ahead])
+    at_rest = np.all(leap < 1.5 * np.maximum(resolution, step) + 3.0 * noise, axis=1)
+    is_chance = len(measured) * chance.prod() ** (end - begin) > _CHANCE
+    repeated[repeated] = np.repeat(~(at_rest & is_chance), end - begin)
+    return repeated
+
+
+# Expected number of runs of equal rows in a log up to which one is no chance.
+_CHANCE = 0.01
+
+
+def _resolutions(measured: FloatArray) -> FloatArray:
+    """Smallest step ``(n,)`` of each signal that is no rounding error; infinite for a constant one."""
+    changes = np.abs(np.diff(measured, axis=0))
+    least = np.sqrt(np.finfo(float).eps) * np.nan_to_num(np.abs(measured)).max(axis=0)
+    return np.asarray(np.where(changes > least, changes, np.inf).min(axis=0))
+
+
+def _noise(measured: FloatArray) -> FloatArray:
+    """Standard deviation ``(n,)`` of the noise of signals by differences of fourth order, in which motion is small."""
+    fourth = np.diff(measured, 4, axis=0)
+    fourth = fourth[np.isfinite(fourth).all(axis=1)]
+    # The variance of a difference of fourth order is 1 + 16 + 36 + 16 + 1 times that of a sample.
+    return np.asarray(robust_std(fourth, axis=0) / np.sqrt(70.0) if len(fourth) else np.zeros(measured.shape[1]))

@@ -27,10 +27,6 @@ class LoDiransacSettings:
     """Fields of `LoDiransac`, which documents them."""
 
     criteria: Settings = field(default_factory=Settings)
-    stuck_rows: bool = True
-    input_window: float = 0.15
-    input_threshold: float = 8.0
-    median_window: float = 0.31
     smoothing_half_width: float = 0.25
     n_samples: int = 200
     input_delay: bool | None = None

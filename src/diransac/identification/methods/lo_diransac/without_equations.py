@@ -34,10 +34,7 @@ _SHORTEST, _LONGEST, _FEWEST_INTERVALS = 5, 25, 4
 """Samples of an interval; intervals of the logs at least."""
 _NOTHING_KNOWN, _SMALL = 1.0, 0.01
 """Standard error of a parameter over its size from which on a log tells nothing of it; size at least."""
-_USED = (
-    "criteria", "stuck_rows", "input_window", "input_threshold", "median_window", "smoothing_half_width", "outliers",
-    "input_delay", "start",
-)  # fmt: skip
+_USED = ("criteria", "smoothing_half_width", "outliers", "input_delay", "start")
 """Settings that are used without equations."""
 _LACKING, _MORE_STARTS = 0.1, 3
 """Part of each change of velocity that a model lacks where its motion is another one; starts from elsewhere then."""
@@ -188,13 +185,12 @@ def followed(
 
 def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, tuple[str, ...]]:
     """Intervals of the logs, and findings of the screening.  Raises LogError: the logs are too short."""
-    samples = [screened(settings, one, dataset.dt) for one in dataset.segments]
+    samples, notes = screened(settings, dataset)
     length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), _SHORTEST, _LONGEST))
     n_rows = sum(map(len, dataset.segments))
     if n_rows < _FEWEST_INTERVALS * length:
         least = _FEWEST_INTERVALS * length
         raise LogError(f"{dataset.source}: {n_rows} rows are too few; it needs at least {least}. Give a longer log")
-    notes = tuple(dict.fromkeys(x for _, _, said in samples for x in said))
     return replace(cut(settings, dataset, samples, length), discrepancies=False), notes
 
 
