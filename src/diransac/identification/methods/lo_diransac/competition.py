@@ -8,7 +8,6 @@ fit, which may be at a local optimum, another one begins with its parameters and
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,10 +30,8 @@ from diransac.identification.methods.lo_diransac.projection import (
 from diransac.identification.methods.lo_diransac.search import (
     Decided,
     Searched,
-    equivalents_of,
     likeliest,
     searched,
-    with_equivalents,
 )
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
@@ -45,7 +42,6 @@ from diransac.identification.methods.lo_diransac.sources import (
     jackknife,
     least_squares_candidates,
 )
-from diransac.identification.structure.equivalents import is_close
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
@@ -58,8 +54,6 @@ if TYPE_CHECKING:
 # Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
 _WITHIN, _WHITE = 0.2, 0.5
 _INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
-# Error of a prediction over that of the answer up to which it is nearly as good.
-_NEARLY = 2.0
 # Half width of an interval of 95 %, standard errors.
 _INTERVAL = 1.96
 # Samples of the intervals of a fit from an estimate at most, as far as their number has divisors.
@@ -105,7 +99,7 @@ def compete(
     """The likeliest explanation of the logs, with the estimate that predicts best.
 
     Where no search from samples succeeds, or its fit is challenged, another one begins with the best of the other
-    estimates, and where other parameters have the same transfer function, with these; the likeliest counts.
+    estimates; the likeliest counts.
 
     Parameters
     ----------
@@ -135,9 +129,7 @@ def compete(
     if first is not None and not first.likeliest.complete:
         return first
     if first is not None and is_settled(first.likeliest, first.motion):
-        first = with_equivalents(settings, dataset, first, seed, callback)
-        if is_settled(first.likeliest, first.motion):
-            return first
+        return first
     intervals, motion, notes = whole
     if first is not None:
         own, motion, notes = first.likeliest.intervals, first.motion, first.notes
@@ -264,7 +256,6 @@ class Contest:
                 found = other
         if found is None:
             return None
-        found = with_equivalents(self.settings, self.dataset, found, self.seed, self.callback)
         if first is None or found.likeliest is not first.likeliest:
             if is_settled(found.likeliest, found.motion):
                 return found
@@ -300,29 +291,7 @@ class Contest:
         answer = replace(winner, parameters=result.parameters)
         outcome = Decided(self._summary(judged), None if of_fit else winner.acting, answer, n_rows)
         impossible = search.impossible if of_fit else ()
-        as_likely = self._as_likely(search, judged, result.parameters)
-        return replace(
-            search, motion=self.motion, result=result, decided=outcome, impossible=impossible, as_likely=as_likely
-        )
-
-    def _as_likely(self, search: Searched, judged: _Judgement, parameters: FloatArray) -> tuple[FloatArray, ...]:
-        """Other parameters that a search found as likely, or with the answer's response that predict nearly as well.
-
-        What the model lacks does not tell them apart.
-        """
-        one, others = self.candidates[judged.comparison.best], list(search.as_likely)
-
-        def errors(p: FloatArray) -> FloatArray:
-            everywhere = np.repeat(p[None], self.blocks.n, axis=0)
-            return judged.judge.scores(replace(one, parameters=p, without=everywhere)).errors
-
-        with suppress(TimeLimitError, np.linalg.LinAlgError):  # what was decided stays
-            others = equivalents_of(self.dataset, self.intervals, parameters) + others
-        others = [p for p in others if not is_close(p, parameters).all()]
-        if not others:
-            return ()
-        own, found = errors(parameters), [(p, errors(p)) for p in others]
-        return tuple(p for p, x in found if predicts(x) and (x < _NEARLY * own).all())
+        return replace(search, motion=self.motion, result=result, decided=outcome, impossible=impossible)
 
     def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""
