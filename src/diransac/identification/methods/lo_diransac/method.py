@@ -114,8 +114,6 @@ class LoDiransac(LoDiransacSettings):
     projection : bool, optional
         Whether discrepancies in the column space of the regressor are attributed to the parameters; otherwise these are
         those of the fit.
-    sources : sequence of str, optional
-        Sources of estimates besides the joint fit: "least squares", "simulation error".
     start : mapping of str to float, optional
         Values of parameters, each in its unit, from which simulation error starts, too.
     horizon : float, optional
