@@ -18,11 +18,9 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.data.log import Log
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.shooting import ShootingIntervals
     from diransac.identification.methods.lo_diransac.smoothing import Motion
-    from diransac.model import Model
 
 N_BLOCKS = 10
 """Number of blocks, of which each is left out in turn."""
@@ -104,49 +102,28 @@ def jackknife(without: FloatArray) -> FloatArray:
 
 
 def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blocks: Blocks) -> Iterator[Candidate]:
-    """Least squares of all rows, of signals as they were recorded and as they are filtered at several bandwidths.
+    """Estimates of the methods `ols` and `nls`: of signals as recorded where all are measured, else as filtered.
 
-    Those that the logs determine and the bounds admit.  Accelerations of at most 3,000 rows are compared in nonlinear
-    least squares, since neighbours of filtered signals have the same information.
+    Those that the logs determine and the bounds admit.
     """
     from diransac.data.dataset import Dataset
-
-    model = dataset.model.with_sensors(())
-    for label, logs, is_usual in _filtered(dataset, model):
-        try:
-            own = replace(Dataset.of(model, logs), layout=dataset.layout)
-        except LogError:
-            continue
-        block = _blocks_of_rows(own, dataset, intervals, blocks)
-        for name in ("ols",) * model.is_affine + ("nls",) * is_usual:
-            check_time()
-            with suppress(IdentificationError, np.linalg.LinAlgError):
-                p, without = (_ordinary if name == "ols" else _nonlinear)(own, block, blocks.n)
-                if np.isfinite([p, *without]).all() and dataset.layout.admits(p[None])[0]:
-                    acting = ActingInputs.recorded(intervals, dataset.hold)
-                    yield Candidate(name + label, p, without, acting, intervals)
-
-
-def _filtered(dataset: Dataset, model: Model) -> Iterator[tuple[str, list[Log], bool]]:
-    """Logs as they are where all signals are measured, and filtered at 1/2 to 4 times the bandwidth of the package.
-
-    With a label, and whether these are the logs of nonlinear least squares.
-    """
     from diransac.data.preprocessing.differentiation import differentiate
 
-    logs = [x.log for x in dataset.segments]
+    model, logs = dataset.model.with_sensors(()), [x.log for x in dataset.segments]
     needed = (*model.coordinates, *model.velocities, *model.accelerations)
     try:
-        usual = [differentiate(x, model) for x in logs]
+        complete = all(name in x for x in logs for name in needed)
+        own = Dataset.of(model, logs if complete else [differentiate(x, model) for x in logs])
     except (LogError, SettingsError):
-        usual = []
-    if all(name in x for x in logs for name in needed):
-        yield "", logs, not usual
-    for factor in (0.5, 1.0, 2.0, 4.0) if usual else ():
-        with suppress(LogError, SettingsError):
-            bands = [factor * x.filter.bandwidth for x in usual if x.filter is not None]
-            filtered = [differentiate(x, model, f) for x, f in zip(logs, bands, strict=True)]
-            yield f", {float(np.median(bands)):.3g} Hz", filtered, factor == 1.0
+        return
+    own = replace(own, layout=dataset.layout)
+    block = _blocks_of_rows(own, dataset, intervals, blocks)
+    for name in ("ols", "nls") if model.is_affine else ("nls",):
+        check_time()
+        with suppress(IdentificationError, np.linalg.LinAlgError):
+            p, without = (_ordinary if name == "ols" else _nonlinear)(own, block, blocks.n)
+            if np.isfinite([p, *without]).all() and dataset.layout.admits(p[None])[0]:
+                yield Candidate(name, p, without, ActingInputs.recorded(intervals, dataset.hold), intervals)
 
 
 def _blocks_of_rows(own: Dataset, dataset: Dataset, intervals: ShootingIntervals, blocks: Blocks) -> IntArray:
