@@ -11,8 +11,13 @@ import pytest
 import diransac as dr
 from diransac.data.dataset import Dataset
 from diransac.identification.methods.lo_diransac.forward import Forward, Reference, forward_predictions
-from diransac.identification.methods.lo_diransac.inverse import equations_of_measured_states, forces_left
-from diransac.identification.methods.lo_diransac.judge import Scores, Selection, judge
+from diransac.identification.methods.lo_diransac.judge import (
+    Scores,
+    Selection,
+    equations_of_measured_states,
+    forces_left,
+    judge,
+)
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
