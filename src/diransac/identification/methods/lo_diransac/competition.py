@@ -152,7 +152,7 @@ class Contest:
         if selection is None:
             return first
         rival = _best_other(candidates, selection)
-        if rival is not None and (first is None or self.is_challenged(first, candidates, selection, rival)):
+        if rival is not None and (first is None or self.is_challenged(first, rival)):
             other = self._searched_from(rival, first)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
                 search = other
@@ -190,17 +190,16 @@ class Contest:
         settings, dataset = self.settings, self.dataset
         holds = [dataset.input_hold] if dataset.input_hold else list(HOLDS)
         actings, found, intervals = [ActingInputs.recorded(self.intervals, x) for x in holds], [], self.intervals
-        given = [settings.start_of(dataset.layout)]
         if first is not None:
             own, intervals = of_fit[0].acting, first.corrected(self.intervals)
             actings = [own] if settings.forces_timing else [*actings, own] if own.differs(actings) else actings
-            given += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
         if not settings.forces_timing:
             report(self.callback, "least squares", 0.88)
             candidates = least_squares_candidates(dataset, self.intervals, blocks)
             found = [replace(x, motion=self.motion) for x in candidates]
         report(self.callback, "simulation error", 0.885)
-        every = [*(x.parameters for x in (*of_fit, *found)), *given]
+        every = [*(x.parameters for x in (*of_fit, *found)), settings.start_of(dataset.layout)]
+        every += [] if first is None else [first.result.parameters, of_fit[-1].parameters]
         known = [x for x in every if x is not None and dataset.layout.admits(x[None])[0]]
         starts = np.array(known or [np.ones(len(dataset.layout))])
         simulated = simulation_error_candidates(
@@ -208,18 +207,14 @@ class Contest:
         )
         return [*found, *(replace(x, motion=motion) for x, motion in simulated)]
 
-    def is_challenged(
-        self, search: Searched, candidates: Sequence[Candidate], selection: Selection, rival: Candidate
-    ) -> bool:
-        """True if a fit is exact although its noise is not white, or if a rival beats or contradicts its estimates.
+    def is_challenged(self, search: Searched, rival: Candidate) -> bool:
+        """True if a fit is exact although its noise is not white, or if a rival contradicts its estimate.
 
         Two estimates contradict each other if their 95 % intervals of a parameter are disjoint.
         """
-        as_good = [x for x, good in zip(candidates, selection.as_good, strict=True) if good]
-        if search.likeliest.exact or all(x.estimate is None for x in as_good):
-            return True
         errors = np.sqrt(np.diag(jackknife(rival.without))) + np.sqrt(np.diag(search.result.covariance))
-        return bool((np.abs(rival.parameters - search.result.parameters) > 1.96 * errors).any())
+        apart = np.abs(rival.parameters - search.result.parameters)
+        return search.likeliest.exact or bool((apart > 1.96 * errors).any())
 
     def _searched_from(self, rival: Candidate, first: Searched | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""
