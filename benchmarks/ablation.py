@@ -35,8 +35,6 @@ from real import DATA, RECORDS, Record, logs_of, scores_of
 from regime_flights import REGIMES, recordings
 
 import diransac as dr
-from diransac.identification.methods.lo_diransac.forward import Forward, Prediction
-from diransac.identification.methods.lo_diransac.sources import Candidate
 from diransac.study import trial_data
 from simulated import MACHINES, as_log, flight
 
@@ -66,17 +64,9 @@ class Part:
         return Part(replace(self.settings, **changed), self.patches + other.patches)
 
 
-def _without_source(name: str) -> Part:
-    return Part(replace(DEFAULT, sources=tuple(x for x in DEFAULT.sources if x != name)))
-
-
-def _with_outliers_of_the_fit(forward: Forward, candidates: Sequence[Candidate]) -> tuple[Forward, list[Prediction]]:
-    """Predictions of all samples but those that a fit takes for outliers."""
-    fair = replace(forward, lost=forward.outliers_of_fit)
-    return fair, [fair.scores(x) for x in candidates]
-
-
 def _parts() -> dict[str, Part]:
+    least_squares = Part(patches=(("competition.least_squares_candidates", lambda *_: ()),))
+    simulation_error = Part(patches=(("competition.simulation_error_candidates", lambda *_, **__: []),))
     off = {"input_delay": False, "input_lag": False, "sensor_delays": (), "sensor_biases": (), "gain_drifts": ()}
     return {
         "nothing": Part(),
@@ -92,11 +82,13 @@ def _parts() -> dict[str, Part]:
         "screening": Part(patches=(("preparation.stuck_rows", lambda x: np.zeros(len(x), bool)),)),
         "robust loss of the projection": Part(patches=(("projection.CAUCHY", None),)),
         "observers": Part(patches=(("search.with_observed_states", lambda *_: None),)),
-        "least squares": _without_source("least squares"),
-        "simulation error": _without_source("simulation error"),
+        "least squares": least_squares,
+        "simulation error": simulation_error,
         "second fit": Part(patches=(("competition.Contest.is_challenged", lambda *_: False),)),
-        "competition": Part(replace(DEFAULT, sources=())),
-        "outliers by predictions": Part(patches=(("forward.Forward.compared", _with_outliers_of_the_fit),)),
+        "competition": least_squares + simulation_error,
+        "outliers by predictions": Part(
+            patches=(("forward.Forward.without_lost", lambda x, _: replace(x, lost=x.outliers_of_fit)),)
+        ),
         "prediction of forces": Part(patches=(("judge._EXPLAINED", 0.0),)),
         "prediction of whole logs": Part(patches=(("forward._LONGEST", 0),)),
         "second-order correction of steps": Part(patches=(("gauss_newton._CORRECTED", 0.0),)),

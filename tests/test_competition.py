@@ -10,8 +10,14 @@ import pytest
 
 import diransac as dr
 from diransac.data.dataset import Dataset
-from diransac.identification.methods.lo_diransac.inverse import Inverse
-from diransac.identification.methods.lo_diransac.judge import Comparison, Judge, Scores
+from diransac.identification.methods.lo_diransac.forward import Forward, Reference, forward_predictions
+from diransac.identification.methods.lo_diransac.judge import (
+    Scores,
+    Selection,
+    equations_of_measured_states,
+    forces_left,
+    judge,
+)
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, Segments, stretches
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
@@ -178,7 +184,7 @@ def test_a_wrong_unit_is_no_failure_of_linear_algebra() -> None:
     assert found.verdict == "do not rely on this"
 
 
-# ---------------------------------------------------------------------- the arbiter
+# ---------------------------------------------------------------------- the judge
 
 
 def candidate(name: str, parameters: np.ndarray, bound: tuple, without: np.ndarray | None = None) -> Candidate:
@@ -187,18 +193,21 @@ def candidate(name: str, parameters: np.ndarray, bound: tuple, without: np.ndarr
     return Candidate(name, parameters, own, ActingInputs.recorded(intervals, "linear"), intervals)
 
 
-def judge_of(bound: tuple, horizon: float | None = None) -> Judge:
+def reference_of(bound: tuple) -> Reference:
     _, intervals, motion, blocks = bound
-    every = np.ones(intervals.measured.shape, bool)
-    acting = ActingInputs.recorded(intervals, "linear")
-    found = Judge.of(acting, intervals, motion, every, motion.spread, blocks, horizon)
-    assert found is not None
-    return found
+    return Reference(intervals, motion, blocks, np.ones(intervals.measured.shape, bool), motion.spread)
 
 
-def comparison(candidates: list[Candidate], bound: tuple) -> Comparison:
-    judge = judge_of(bound)
-    return Comparison.of([judge.scores(x) for x in candidates])
+def predictions_of(bound: tuple) -> list[Forward]:
+    return forward_predictions(reference_of(bound), None)
+
+
+def comparison(candidates: list[Candidate], bound: tuple) -> Selection:
+    """Of all samples, those that no candidate predicts included."""
+    predictions, forces = predictions_of(bound), forces_left(reference_of(bound), candidates)
+    pairs = [[x.scores(one) for x in predictions] for one in candidates]
+    parts = [[np.concatenate(x) for x in zip(*own, strict=True)] for own in pairs]
+    return Selection.of([Scores(*own, left) for own, left in zip(parts, forces, strict=True)])
 
 
 def test_better_predictions_win_whatever_their_order(bound: tuple) -> None:
@@ -232,7 +241,7 @@ def scores(losses: list[list[float]], errors: list[float], forces: list[list[flo
 def test_horizons_that_nothing_predicts_do_not_count() -> None:
     right = scores([[1e-2, 1.1e-2, 0.9e-2], [0.8, 0.9, 1.0]], [0.1, 3.0])
     dull = scores([[2e-2, 2.1e-2, 1.9e-2], [0.2, 0.3, 0.1]], [0.2, 1.2])
-    assert Comparison.of([dull, right]).best == 1
+    assert Selection.of([dull, right]).best == 1
 
 
 def test_weights_are_those_of_a_difference_in_another_log() -> None:
@@ -240,13 +249,13 @@ def test_weights_are_those_of_a_difference_in_another_log() -> None:
     factors = np.exp([0.2, 0.4, 0.0, 0.2])
     other = scores([(base * factors).tolist()], [0.1])
     z = (0.2 - 0.02) / (np.std([0.2, 0.4, 0.0, 0.2]) / np.sqrt(3.0))
-    found = Comparison.of([scores([base.tolist()], [0.1]), other])
+    found = Selection.of([scores([base.tolist()], [0.1]), other])
     np.testing.assert_allclose(found.weights, [1.0, np.exp(-0.25 * z**2)], rtol=1e-2)
 
 
 def test_a_difference_of_a_fiftieth_does_not_count() -> None:
     """However often it is the same: estimates that differ by less stay in the intervals of the winner."""
-    found = Comparison.of([scores([[1e-2] * 4], [0.1]), scores([[1.01e-2] * 4], [0.1])])
+    found = Selection.of([scores([[1e-2] * 4], [0.1]), scores([[1.01e-2] * 4], [0.1])])
     assert found.as_good.all()
     assert found.weights.tolist() == [1.0, 1.0]
 
@@ -255,7 +264,7 @@ def test_a_locked_joint_fails_absurdly() -> None:
     """It predicts rest as well as the right estimate does, and needs a force that is not there."""
     right = scores([[1e-2, 1.2e-2, 1e-2]], [0.1], [[0.01, 0.02, 0.01]])
     locked = scores([[0.9e-2, 1.0e-2, 0.9e-2]], [0.1], [[1e20, 1e20, 1e20]])
-    found = Comparison.of([locked, right])
+    found = Selection.of([locked, right])
     assert found.best == 1
     assert found.weights[0] == 0.0
     assert not found.as_good[0]
@@ -263,13 +272,13 @@ def test_a_locked_joint_fails_absurdly() -> None:
 
 def test_equations_decide_where_predictions_are_as_good() -> None:
     left = np.array([0.010, 0.012, 0.011])
-    found = Comparison.of([scores([[1e-2] * 3], [0.1], [x.tolist()]) for x in (1.5 * left, left)])
+    found = Selection.of([scores([[1e-2] * 3], [0.1], [x.tolist()]) for x in (1.5 * left, left)])
     assert found.best == 1
 
 
 def test_noisy_equations_do_not_decide() -> None:
     """Where every estimate leaves half of the force, the one that leaves least may be attenuated."""
-    found = Comparison.of([scores([[1e-2] * 3], [0.1], [[x] * 3]) for x in (0.5, 0.3)])
+    found = Selection.of([scores([[1e-2] * 3], [0.1], [[x] * 3]) for x in (0.5, 0.3)])
     assert found.best == 0
     assert found.as_good.all()
 
@@ -278,7 +287,7 @@ def test_the_force_that_is_left_is_the_residual_of_the_smoothed_motion(bound: tu
     """Mean squares under bumps by NumPy, over the larger variance of inertial force and force of the input."""
     _, intervals, motion, blocks = bound
     factors = np.array([1.0, 1.0, 1.2, 1.0])
-    found = Inverse.of(intervals, motion, blocks).forces_left([candidate("stiff", truth() * factors, bound)])[0]
+    found = forces_left(reference_of(bound), [candidate("stiff", truth() * factors, bound)])[0]
     n, H = int(intervals.is_logged.sum()), intervals.length
     y, v, a = motion.signals[:n, :3].T
     m, d, k, c = truth() * factors
@@ -298,13 +307,13 @@ def test_no_equation_of_an_unmeasured_state_is_compared() -> None:
     )  # fmt: skip
     t = 0.1 * np.arange(400)
     log = dr.Log.from_arrays(t, {"h2": np.sin(t), "u": np.cos(t)})
-    intervals, motion, _ = prepared(dr.LoDiransac(), Dataset.of(model, log, pointwise=False))
-    assert Inverse.of(intervals, motion, Blocks.of(intervals)).equations.tolist() == [1]
+    intervals, _, _ = prepared(dr.LoDiransac(), Dataset.of(model, log, pointwise=False))
+    assert equations_of_measured_states(intervals).tolist() == [1]
 
 
 def test_a_block_of_a_whole_log_is_predicted_without_its_own_estimate(bound: tuple) -> None:
     """Samples of a block alone count in the simulation by the estimate without it."""
-    whole = judge_of(bound).forward[-1]
+    whole = predictions_of(bound)[-1]
     assert whole.steps == (int(bound[1].is_logged.sum()) - bound[1].length,)
     assert whole.left_out.sum(axis=1).tolist() == [1] * bound[3].n
     without = np.tile(truth(), (bound[3].n, 1))
@@ -315,15 +324,15 @@ def test_a_block_of_a_whole_log_is_predicted_without_its_own_estimate(bound: tup
 
 
 def test_a_segment_is_predicted_without_all_blocks_that_it_touches(bound: tuple) -> None:
-    judge = judge_of(bound).forward[0]
-    rows = judge.segments.rows
+    short = predictions_of(bound)[0]
+    rows = short.segments.rows
     touched = [np.unique(bound[3].of_row[x]) for x in rows]
     assert max(len(x) for x in touched) > 1
-    assert all(np.flatnonzero(own).tolist() == x.tolist() for own, x in zip(judge.left_out, touched, strict=True))
+    assert all(np.flatnonzero(own).tolist() == x.tolist() for own, x in zip(short.left_out, touched, strict=True))
     apart = np.arange(1.0, bound[3].n + 1.0)[:, None] * 1e-3 * truth()
     one = candidate("one", truth(), bound, truth() + apart)
     expected = truth() + np.array([apart[x].sum(axis=0) for x in touched])
-    np.testing.assert_allclose(one.without_blocks(judge.left_out), expected, rtol=1e-12)
+    np.testing.assert_allclose(one.without_blocks(short.left_out), expected, rtol=1e-12)
 
 
 def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> None:
@@ -336,11 +345,12 @@ def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> No
     measured[burst] += 50.0 * motion.spread * rng.uniform(0.5, 1.0, (burst.sum(), 1))
     with_bursts = (dataset, replace(intervals, measured=measured), motion, blocks)
     competitors = [candidate(str(x), truth() * x, with_bursts) for x in (1.0, 1.3, 30.0)]
-    judge = judge_of(with_bursts)
-    assert Comparison.of([judge.scores(x) for x in competitors]).as_good[1]
-    fair, found = judge.compared(competitors)
-    assert Comparison.of(found).as_good.tolist() == [True, False, False]
-    short = fair.forward[0]
+    assert comparison(competitors, with_bursts).as_good[1]
+    found = judge(reference_of(with_bursts), competitors)
+    assert found is not None
+    assert found.as_good.tolist() == [True, False, False]
+    short = predictions_of(with_bursts)[0]
+    short = short.without_lost(short._errors(competitors))
     assert short.lost is not None
     rows = short.segments.rows[:, short.n_before :]
     lost = short.lost[0]
@@ -349,11 +359,11 @@ def test_samples_that_no_good_estimate_predicts_do_not_count(bound: tuple) -> No
 
 
 def test_samples_count_where_every_estimate_predicts_badly(bound: tuple) -> None:
-    judge = judge_of(bound)
     bad = [candidate(str(k), truth() * [1.0, 1.0, k, 1.0], bound) for k in (0.3, 2.5)]
-    fair, found = judge.compared(bad)
-    assert all(x.lost is None for x in fair.forward)
-    assert [x.errors.tolist() for x in found] == [judge.scores(x).errors.tolist() for x in bad]
+    found = judge(reference_of(bound), bad)
+    assert found is not None
+    every = comparison(bad, bound)
+    assert [x.errors.tolist() for x in found.scores] == [x.errors.tolist() for x in every.scores]
 
 
 def test_blocks_in_which_the_best_estimate_fails_count_where_another_one_predicts_them(bound: tuple) -> None:
@@ -361,16 +371,16 @@ def test_blocks_in_which_the_best_estimate_fails_count_where_another_one_predict
     failing = np.tile(truth(), (bound[3].n, 1))
     failing[:4, 2] *= 2.0
     one, other = candidate("one", truth(), bound, failing), candidate("other", truth() * 1.1, bound)
-    judge = judge_of(bound)
-    _, found = judge.compared([one, other])
-    assert (found[0].errors < 0.5 * found[1].errors).all()
-    assert Comparison.of(found).losses == pytest.approx(Comparison.of([judge.scores(x) for x in (one, other)]).losses)
+    found = judge(reference_of(bound), [one, other])
+    assert found is not None
+    assert (found.scores[0].errors < 0.5 * found.scores[1].errors).all()
+    assert found.losses == pytest.approx(comparison([one, other], bound).losses)
 
 
 def test_horizon_is_the_one_that_is_asked_for(bound: tuple) -> None:
-    found = judge_of(bound, 0.05)
-    assert len(found.horizons) == 1
-    assert found.horizons[0] == pytest.approx(0.05, abs=1.0 / RATE)
+    found = judge(reference_of(bound), [candidate("right", truth(), bound)], 0.05)
+    assert found is not None
+    assert found.steps == (round(0.05 * RATE),)
 
 
 def test_jackknife_is_that_of_a_mean() -> None:
@@ -433,13 +443,6 @@ def test_the_competition_is_printed_and_stored(lacking: dr.Result, tmp_path) -> 
     assert dr.Result.load(tmp_path / "model.json").competition == lacking.competition
 
 
-def test_a_source_can_be_switched_off() -> None:
-    method = dr.LoDiransac(sources=("least squares",))
-    found = dr.identify(oscillator(), ringing(lacks=0.01), method, differentiate=True).competition
-    assert found is not None
-    assert not any(x.name.startswith("simulation error") for x in found.competitors)
-
-
 def test_exact_logs_have_no_competition() -> None:
     model, rng = dr.models.underwater_vehicle(), np.random.default_rng(0)
     t = np.arange(0.0, 60.0, 0.05)
@@ -469,8 +472,3 @@ def test_exact_logs_have_no_competition() -> None:
 def test_start_and_horizon_are_checked(options: dict, what: str) -> None:
     with pytest.raises(dr.SettingsError, match=what):
         dr.identify(oscillator(), ringing(600), differentiate=True, **options)
-
-
-def test_an_unknown_source_is_refused() -> None:
-    with pytest.raises(dr.SettingsError, match="sources"):
-        dr.LoDiransac(sources=("guess",))

@@ -237,7 +237,7 @@ def test_forces_of_the_start_are_not_remembered():
 
 
 def test_change_since_an_identification_is_reported():
-    result = dr.identify(MODEL, flown(800, 9), dr.LoDiransac(suggestions=False, sources=()))
+    result = dr.identify(MODEL, flown(800, 9), dr.LoDiransac(suggestions=False))
     log = flown(700, 4, change=(-1.0, ("mass",), 1.3))
     changes = [x for now in dr.track(MODEL, log, start=result) for x in now.changes]
     assert [x.parameter for x in changes] == ["mass"]

@@ -24,7 +24,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | `missing_terms.py`, `term_regression.py` | terms that the model may lack, and their weights |
 | **comparison with other estimates** | |
 | `competition.py`, `sources.py` | estimates by other means, of which one is the answer |
-| `judge.py`, `forward.py`, `inverse.py` | their predictions of held-out blocks: of motion, and of forces |
+| `judge.py`, `forward.py` | their predictions of held-out blocks: of motion, and of forces |
 | `simulation_error.py`, `segments.py` | one of them: simulation error of segments |
 | **models without equations** | |
 | `without_equations.py`, `prediction_error.py`, `following.py`, `linear_intervals.py` | by a simulator alone |

@@ -7,19 +7,19 @@ fit, which may be at a local optimum, another one begins with its parameters and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import FloatArray
 from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.estimate import Competition, Competitor, predicts
 from diransac.identification.method import report, within
+from diransac.identification.methods.lo_diransac.forward import Reference
 from diransac.identification.methods.lo_diransac.interval_effects import effect_of_intervals
-from diransac.identification.methods.lo_diransac.judge import Comparison, Judge, Scores
+from diransac.identification.methods.lo_diransac.judge import Selection, judge
 from diransac.identification.methods.lo_diransac.local_search import fewest_parts
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.projection import (
@@ -28,24 +28,15 @@ from diransac.identification.methods.lo_diransac.projection import (
     projected_candidates,
     with_parameters,
 )
-from diransac.identification.methods.lo_diransac.search import (
-    Decided,
-    Searched,
-    equivalents_of,
-    likeliest,
-    searched,
-    with_equivalents,
-)
+from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
-from diransac.identification.methods.lo_diransac.smoothing import Motion
 from diransac.identification.methods.lo_diransac.sources import (
     Blocks,
     Candidate,
     jackknife,
     least_squares_candidates,
 )
-from diransac.identification.structure.equivalents import is_close
 from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
@@ -54,45 +45,29 @@ if TYPE_CHECKING:
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+    from diransac.identification.methods.lo_diransac.smoothing import Motion
 
-# Noise over the spread of the signal, and its correlation from sample to sample, up to which an exact model is right.
-_WITHIN, _WHITE = 0.2, 0.5
-_INLYING, _TINY, _LEAST_NOISE = 0.5, 1e-300, 1e-4
-# Error of a prediction over that of the answer up to which it is nearly as good.
-_NEARLY = 2.0
-# Half width of an interval of 95 %, standard errors.
-_INTERVAL = 1.96
-# Samples of the intervals of a fit from an estimate at most, as far as their number has divisors.
-_SHORT = 25
+_INLYING = 0.5
+"""Probability of no outlier from which on a sample counts, and fraction of outliers that is a majority."""
+_TINY = 1e-300
 
 
 def is_settled(explanation: Explanation, motion: Motion) -> bool:
     """True if the exact model predicts the log within the noise of its most accurate signal.
 
-    That noise is small beside the signal, and hardly correlated from sample to sample.  Outliers are the minority of
-    every signal: a fit that has lost one takes the rest for them.
-
-    Parameters
-    ----------
-    explanation : Explanation
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-
-    Returns
-    -------
-    bool
+    That noise is small beside the spread of the smoothed motion (a fifth at most), and hardly correlated from sample to
+    sample (a half).  Outliers are the minority of every signal: a fit that has lost one takes the rest for them.
     """
     if not explanation.exact:
         return False
-    intervals, fit = explanation.intervals, explanation.refinement.fit
-    share = np.where(intervals.known.any(axis=0), fit.noise.sigma / np.maximum(motion.spread, _TINY), np.inf)
+    known, fit = explanation.intervals.known, explanation.refinement.fit
+    measured = known.any(axis=0)
+    share = np.where(measured, fit.noise.sigma / np.maximum(motion.spread, _TINY), np.inf)
     best = int(np.argmin(share))
-    inlying = fit.noise.inlying(fit.residuals, intervals.known)[:, best] > _INLYING
-    e = fit.residuals[:, best] / fit.noise.sigma[best]
-    both = inlying[1:] & inlying[:-1]
+    inlying = fit.noise.inlying(fit.residuals, known)[:, best] > _INLYING
+    e, both = fit.residuals[:, best] / fit.noise.sigma[best], inlying[1:] & inlying[:-1]
     correlation = (e[1:] * e[:-1])[both].mean() if both.any() else 0.0
-    explains_most = (fit.noise.pi < _INLYING)[intervals.known.any(axis=0)].all()
-    return bool(share[best] < _WITHIN and correlation < _WHITE and explains_most)
+    return bool(share[best] < 0.2 and correlation < 0.5 and (fit.noise.pi < _INLYING)[measured].all())
 
 
 def compete(
@@ -102,23 +77,10 @@ def compete(
     seed: int,
     callback: Callback | None,
 ) -> Searched:
-    """The likeliest explanation of the logs, with the estimate that predicts best.
+    """The likeliest explanation of the logs, `prepared`, with the estimate that predicts best.
 
     Where no search from samples succeeds, or its fit is challenged, another one begins with the best of the other
-    estimates, and where other parameters have the same transfer function, with these; the likeliest counts.
-
-    Parameters
-    ----------
-    settings : LoDiransacSettings
-    dataset : Dataset
-    whole : (ShootingIntervals, Motion, tuple of str)
-        As from `prepared`.
-    seed : int
-    callback : callable or None
-
-    Returns
-    -------
-    Searched
+    estimates; the likeliest counts.
 
     Raises
     ------
@@ -127,55 +89,33 @@ def compete(
     TimeLimitError
         The time limit was reached before a search had converged.
     """
-    refused: Exception | None = None
+    first, refusal, (intervals, motion, notes) = None, None, whole
     try:
         first = likeliest(settings, dataset, seed, callback, whole)
     except (IdentificationError, np.linalg.LinAlgError) as error:
-        first, refused = None, error
-    if first is not None and not first.likeliest.complete:
-        return first
-    if first is not None and is_settled(first.likeliest, first.motion):
-        first = with_equivalents(settings, dataset, first, seed, callback)
-        if is_settled(first.likeliest, first.motion):
+        refusal = error
+    else:
+        if not first.likeliest.complete or is_settled(first.likeliest, first.motion):
             return first
-    intervals, motion, notes = whole
-    if first is not None:
-        own, motion, notes = first.likeliest.intervals, first.motion, first.notes
-        intervals = replace(intervals, substeps=own.substeps, recorded=own.recorded)
-    contest = Contest(settings, dataset, intervals, motion, seed, callback)
+        of_fit, motion, notes = first.likeliest.intervals, first.motion, first.notes
+        intervals = replace(intervals, substeps=of_fit.substeps, recorded=of_fit.recorded)
     try:
-        contest.add_sources(first)
-        found = contest.outcome(first, notes)
+        search = Contest(settings, dataset, intervals, motion, notes, seed, callback).outcome(first)
     except TimeLimitError:
         if first is None:
             raise
         return replace(first, likeliest=replace(first.likeliest, complete=False))
-    if found is not None and (first is not None or found.decided is None or found.decided.summary.predicts):
-        return found
-    if isinstance(refused, IdentificationError):
-        raise refused
-    failed = f"the joint fit fails numerically ({refused}), and no other estimate predicts the log"
+    if search is not None and (first is not None or search.decided is None or search.decided.summary.predicts):
+        return search
+    if isinstance(refusal, IdentificationError):
+        raise refusal
+    failed = f"the joint fit fails numerically ({refusal}), and no other estimate predicts the log"
     raise IdentificationError(f"{dataset.source}: {failed}; compare the model's constants with the machine")
 
 
-class _Entry(NamedTuple):
-    """A candidate, and the fit or the motion that it came from."""
-
-    candidate: Candidate
-    origin: Motion | Explanation
-
-
-class _Judgement(NamedTuple):
-    """Scores of all candidates, in their order, and their comparison."""
-
-    judge: Judge
-    scores: list[Scores]
-    comparison: Comparison
-
-
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Contest:
-    """Candidates of one dataset, and their comparison.
+    """Competition of the estimates of one dataset.
 
     Parameters
     ----------
@@ -185,6 +125,8 @@ class Contest:
         With inputs and measurements as recorded.
     motion : Motion
         Smoothed motion over their rows.
+    notes : tuple of str
+        Of the preparation.
     seed : int
     callback : callable or None
     """
@@ -193,243 +135,159 @@ class Contest:
     dataset: Dataset
     intervals: ShootingIntervals
     motion: Motion
+    notes: tuple[str, ...]
     seed: int
     callback: Callback | None
 
-    def __post_init__(self) -> None:
-        self.blocks = Blocks.of(self.intervals)
-        self.entries: list[_Entry] = []
-
-    @property
-    def candidates(self) -> list[Candidate]:
-        """In the order in which they are preferred where they predict as well."""
-        return [x.candidate for x in self.entries]
-
-    def add_fit(self, found: Searched) -> None:
-        """Let the estimates of a joint fit take part, before the others, and instead of those of another fit."""
-        some = _estimates_of_fit(found.likeliest, self._acting(found), self.blocks)
-        others = [x for x in self.entries if isinstance(x.origin, Motion)]
-        self.entries = [*(_Entry(x, found.likeliest) for x in some), *others]
-
-    def _acting(self, found: Searched) -> ActingInputs:
-        """Inputs as they act in a fit."""
-        intervals = found.likeliest.intervals
-        return ActingInputs(
-            intervals.inputs, intervals.hold, found.timing(forced=self.settings.forces_timing), fitted=True
-        )
-
-    def add_sources(self, first: Searched | None) -> None:
-        """Add a fit's estimates, least squares of all rows, and simulation error, which starts from all of these."""
-        sources, dataset = self.settings.sources, self.dataset
-        intervals = self.intervals if first is None else first.corrected(self.intervals)
-        holds = [dataset.input_hold] if dataset.input_hold else list(HOLDS)
-        actings = [ActingInputs.recorded(self.intervals, hold) for hold in holds]
-        if first is not None:
-            self.add_fit(first)
-            own = self._acting(first)
-            actings = [own] if self.settings.forces_timing else [*actings, own] if own.differs(actings) else actings
-        if "least squares" in sources and not self.settings.forces_timing:
-            report(self.callback, "least squares", 0.88)
-            found = least_squares_candidates(dataset, self.intervals, self.blocks)
-            self.entries += [_Entry(x, self.motion) for x in found]
-        if "simulation error" in sources:
-            report(self.callback, "simulation error", 0.885)
-            simulated = simulation_error_candidates(
-                intervals, self.motion, self._starts(first), actings, self.seed, self.blocks,
-                outliers=self.settings.outliers,
-            )  # fmt: skip
-            self.entries += [_Entry(x, motion) for x, motion in simulated]
-
-    def _starts(self, first: Searched | None) -> FloatArray:
-        """Parameters ``(m, n)`` from which simulation error starts, within the bounds."""
-        found, given = [x.parameters for x in self.candidates], self.settings.start_of(self.dataset.layout)
-        found += [] if given is None else [given]
-        if first is not None:
-            found += [first.result.parameters, first.likeliest.refinement.fit.shared[: self.intervals.n_p]]
-        found = [x for x in found if self.dataset.layout.admits(x[None])[0]]
-        return np.array(found or [np.ones(len(self.dataset.layout))])
-
-    def outcome(self, first: Searched | None, notes: tuple[str, ...]) -> Searched | None:
+    def outcome(self, first: Searched | None) -> Searched | None:
         """The likeliest search, with the estimate that predicts best; None where none succeeds.
 
         The first search stays as it is where the logs are too short to be compared.
         """
-        found, judged = first, self._judged(first)
-        if judged is None:
+        blocks, search = Blocks.of(self.intervals), first
+        of_fit = [] if first is None else list(self._of_fit(first, blocks))
+        others = self._others(first, of_fit, blocks)
+        candidates = [*of_fit, *others]
+        selection = self._judged(first, candidates, blocks)
+        if selection is None:
             return first
-        best = self._best_other(judged)
-        if best is not None and (first is None or self.is_challenged(first, judged, best)):
-            other = self._searched_from(best, notes, None if first is None else first.likeliest)
+        rival = _best_other(candidates, selection)
+        if rival is not None and (first is None or self.is_challenged(first, rival)):
+            other = self._searched_from(rival, first)
             if other is not None and (first is None or other.likeliest.cost < first.likeliest.cost):
-                found = other
-        if found is None:
+                search = other
+        if search is None:
             return None
-        found = with_equivalents(self.settings, self.dataset, found, self.seed, self.callback)
-        if first is None or found.likeliest is not first.likeliest:
-            if is_settled(found.likeliest, found.motion):
-                return found
-            self.add_fit(found)
-            judged = self._judged(found)
-        return found if judged is None else self._decided(found, judged)
+        if search is not first:
+            if is_settled(search.likeliest, search.motion):
+                return search
+            candidates = [*self._of_fit(search, blocks), *others]
+            selection = self._judged(search, candidates, blocks)
+        return search if selection is None else self._decided(search, candidates, selection)
 
-    def is_challenged(self, search: Searched, judged: _Judgement, rival: int) -> bool:
-        """True if a fit is exact although its noise is not white, or if a rival beats or contradicts its estimates.
+    def _of_fit(self, search: Searched, blocks: Blocks) -> Iterator[Candidate]:
+        """Parameters read from a fit: by least squares on its motion over windows of each length, and its own."""
+        intervals, fit = search.likeliest.intervals, search.likeliest.refinement.fit
+        timing = search.timing(forced=self.settings.forces_timing)
+        acting = ActingInputs(intervals.inputs, intervals.hold, timing, fitted=True)
+        block, K = blocks.of_row[intervals.starts], blocks.n
 
-        Two estimates contradict each other if their intervals of a parameter are disjoint.
-        """
-        fitted = np.array([not isinstance(x.origin, Motion) for x in self.entries])
-        if search.likeliest.exact or not (judged.comparison.as_good & fitted).any():
-            return True
-        one, variances = self.candidates[rival], np.diag(search.result.covariance)
-        spans = _INTERVAL * (np.sqrt(np.diag(jackknife(one.without))) + np.sqrt(variances))
-        return bool((np.abs(one.parameters - search.result.parameters) > spans).any())
+        def candidate(
+            name: str, estimate: Callable[[], ProjectedEstimate], p: FloatArray, parts: FloatArray
+        ) -> Candidate:
+            sums = np.array([parts[block == k].sum(axis=0) for k in range(K)])
+            return Candidate(name, p, p + K / (K - 1.0) * sums, acting, intervals, estimate)
 
-    def _best_other(self, judged: _Judgement) -> int | None:
-        """The best estimate that no fit gave; None where a fit predicts better, or no estimate predicts."""
-        as_good, losses = judged.comparison.as_good, judged.comparison.losses
-        others = [k for k, x in enumerate(self.entries) if isinstance(x.origin, Motion) and as_good[k]]
-        best = min(others, key=lambda k: losses[k], default=None)
-        return best if best is not None and predicts(judged.scores[best].errors) else None
+        if not search.likeliest.exact:
+            for seconds, estimate, p, parts in projected_candidates(intervals, fit):
+                if not intervals.layout.violations(p) and np.isfinite(p).all():
+                    yield candidate(f"least squares on the fitted motion, {seconds:.2g} s", estimate, p, parts)
+        own = fitted_parameters(intervals, fit)
+        yield candidate("joint fit", lambda: own, own.parameters, -effect_of_intervals(intervals, fit).steps)
 
-    def _decided(self, search: Searched, judged: _Judgement) -> Searched:
-        """A search with the estimate that predicts best."""
-        winner, origin = self.entries[judged.comparison.best]
-        of_fit = not isinstance(origin, Motion)
-        result = self._result(judged, search.likeliest)
-        n_rows = judged.judge.steps[int(np.argmin(judged.scores[judged.comparison.best].errors))]
-        answer = replace(winner, parameters=result.parameters)
-        outcome = Decided(self._summary(judged), None if of_fit else winner.acting, answer, n_rows)
-        impossible = search.impossible if of_fit else ()
-        as_likely = self._as_likely(search, judged, result.parameters)
-        return replace(
-            search, motion=self.motion, result=result, decided=outcome, impossible=impossible, as_likely=as_likely
+    def _others(self, first: Searched | None, of_fit: Sequence[Candidate], blocks: Blocks) -> list[Candidate]:
+        """Least squares of all rows, and simulation error, which starts from all other estimates."""
+        settings, dataset = self.settings, self.dataset
+        holds = [dataset.input_hold] if dataset.input_hold else list(HOLDS)
+        actings, found, intervals = [ActingInputs.recorded(self.intervals, x) for x in holds], [], self.intervals
+        if first is not None:
+            own, intervals = of_fit[0].acting, first.corrected(self.intervals)
+            actings = [own] if settings.forces_timing else [*actings, own] if own.differs(actings) else actings
+        if not settings.forces_timing:
+            report(self.callback, "least squares", 0.88)
+            candidates = least_squares_candidates(dataset, self.intervals, blocks)
+            found = [replace(x, motion=self.motion) for x in candidates]
+        report(self.callback, "simulation error", 0.885)
+        every = [*(x.parameters for x in (*of_fit, *found)), settings.start_of(dataset.layout)]
+        every += [] if first is None else [first.result.parameters, of_fit[-1].parameters]
+        known = [x for x in every if x is not None and dataset.layout.admits(x[None])[0]]
+        starts = np.array(known or [np.ones(len(dataset.layout))])
+        simulated = simulation_error_candidates(
+            intervals, self.motion, starts, actings, self.seed, blocks, outliers=settings.outliers
         )
+        return [*found, *(replace(x, motion=motion) for x, motion in simulated)]
 
-    def _as_likely(self, search: Searched, judged: _Judgement, parameters: FloatArray) -> tuple[FloatArray, ...]:
-        """Other parameters that a search found as likely, or with the answer's response that predict nearly as well.
+    def is_challenged(self, search: Searched, rival: Candidate) -> bool:
+        """True if a fit is exact although its noise is not white, or if a rival contradicts its estimate.
 
-        What the model lacks does not tell them apart.
+        Two estimates contradict each other if their 95 % intervals of a parameter are disjoint.
         """
-        one, others = self.candidates[judged.comparison.best], list(search.as_likely)
+        errors = np.sqrt(np.diag(jackknife(rival.without))) + np.sqrt(np.diag(search.result.covariance))
+        apart = np.abs(rival.parameters - search.result.parameters)
+        return search.likeliest.exact or bool((apart > 1.96 * errors).any())
 
-        def errors(p: FloatArray) -> FloatArray:
-            everywhere = np.repeat(p[None], self.blocks.n, axis=0)
-            return judged.judge.scores(replace(one, parameters=p, without=everywhere)).errors
-
-        with suppress(TimeLimitError, np.linalg.LinAlgError):  # what was decided stays
-            others = equivalents_of(self.dataset, self.intervals, parameters) + others
-        others = [p for p in others if not is_close(p, parameters).all()]
-        if not others:
-            return ()
-        own, found = errors(parameters), [(p, errors(p)) for p in others]
-        return tuple(p for p, x in found if predicts(x) and (x < _NEARLY * own).all())
-
-    def _searched_from(self, best: int, notes: tuple[str, ...], rival: Explanation | None) -> Searched | None:
+    def _searched_from(self, rival: Candidate, first: Searched | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""
-        one, motion = self.entries[best]
-        assert isinstance(motion, Motion)
-        intervals = one.intervals
-        while intervals.length > _SHORT and (parts := fewest_parts(intervals.length)):
+        assert rival.motion is not None
+        intervals = rival.intervals
+        while intervals.length > 25 and (parts := fewest_parts(intervals.length)):
             intervals = intervals.split(parts)
         try:
             return searched(
-                self.settings, replace(intervals, hold=one.acting.hold), motion, notes, self.seed, self.dataset,
-                within(self.callback, 0.89, 0.895), one.parameters[None], rival,
+                self.settings, replace(intervals, hold=rival.acting.hold), rival.motion, self.notes, self.seed,
+                self.dataset, within(self.callback, 0.89, 0.895), rival.parameters[None],
+                None if first is None else first.likeliest,
             )  # fmt: skip
         except (IdentificationError, np.linalg.LinAlgError):
             return None
 
-    def _judged(self, search: Searched | None) -> _Judgement | None:
-        """Comparison of all candidates; None where the logs are too short for one, or nothing takes part.
-
-        Outliers before a prediction, and the noise, are those of the search.
-        """
-        if not self.entries:
-            return None
+    def _judged(self, search: Searched | None, candidates: Sequence[Candidate], blocks: Blocks) -> Selection | None:
+        """Comparison of all candidates; outliers before a prediction, and the noise, are those of the search."""
         report(self.callback, "comparing predictions", 0.89)
-        inlying, noise = self._noise_of(search)
-        acting, horizon = self.entries[0].candidate.acting, self.settings.horizon
-        judge = Judge.of(acting, self.intervals, self.motion, inlying, noise, self.blocks, horizon)
-        if judge is None:
-            return None
-        judge, scores = judge.compared(self.candidates)
-        if not any(np.isfinite(x.losses).any() for x in scores):
-            return None
-        judged = _Judgement(judge, scores, Comparison.of(scores))
-        best = judged.comparison.best
-        winner = self.candidates[best]
-        errors = ", ".join(f"{x:.2g}" for x in scores[best].errors)
-        best_so_far = f"best so far: {winner.name}, held-out errors {errors} of those of no change"
-        parameters = dict(zip(self.dataset.layout.names, winner.parameters.tolist(), strict=True))
-        report(self.callback, "comparing predictions", 0.89, best_so_far, parameters=parameters)
-        return judged
-
-    def _noise_of(self, search: Searched | None) -> tuple[BoolArray, FloatArray]:
-        """Samples that are no outliers ``(N, n_s)``, and the noise ``(n_s,)`` of each signal."""
-        floor = np.maximum(_LEAST_NOISE * self.motion.spread, _TINY)
+        spread = self.motion.spread
         if search is None or search.explains_nothing:
-            return inlying_samples(self.intervals, self.motion), np.maximum(self.motion.spread, floor)
-        own, fit = search.likeliest.intervals, search.likeliest.refinement.fit
-        inlying = fit.noise.inlying(fit.residuals, own.known) >= _INLYING
-        noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, self.motion.spread)
-        return inlying | ~own.known, np.maximum(noise, floor)
+            inlying, noise = inlying_samples(self.intervals, self.motion), spread
+        else:
+            known, fit = search.likeliest.intervals.known, search.likeliest.refinement.fit
+            inlying = (fit.noise.inlying(fit.residuals, known) >= _INLYING) | ~known
+            noise = np.where(np.isfinite(fit.noise.sigma) & (fit.noise.sigma > 0.0), fit.noise.sigma, spread)
+        noise = np.maximum(noise, np.maximum(1e-4 * spread, _TINY))
+        reference = Reference(self.intervals, self.motion, blocks, inlying, noise)
+        selection = judge(reference, candidates, self.settings.horizon)
+        if selection is not None:
+            winner, errors = candidates[selection.best], selection.scores[selection.best].errors
+            said = ", ".join(f"{x:.2g}" for x in errors)
+            note = f"best so far: {winner.name}, held-out errors {said} of those of no change"
+            report(self.callback, "comparing predictions", 0.89, note, parameters=self._by_name(winner))
+        return selection
 
-    def _result(self, judged: _Judgement, fit_of: Explanation) -> ProjectedEstimate:
-        """The winner, with a covariance that covers those that predict as well."""
-        best, weights = judged.comparison.best, judged.comparison.weights
-        one = self.candidates[best]
-        parameters = np.array([x.parameters for x in self.candidates])
-        apart = np.where(weights[:, None] > 0.0, parameters - one.parameters, 0.0)
-        spread = (weights * apart.T) @ apart / weights.sum()
-        found = one.estimate() if one.estimate is not None else self._of_blocks(one, fit_of)
-        found = replace(found, covariance=found.covariance + spread)
-        return with_parameters(fit_of.intervals, fit_of.refinement.fit, found, one.parameters)
+    def _by_name(self, candidate: Candidate) -> dict[str, float]:
+        return dict(zip(self.dataset.layout.names, candidate.parameters.tolist(), strict=True))
 
-    def _of_blocks(self, one: Candidate, fit_of: Explanation) -> ProjectedEstimate:
+    def _decided(self, search: Searched, candidates: Sequence[Candidate], selection: Selection) -> Searched:
+        """A search with the estimate that predicts best, whose covariance covers those that predict as well."""
+        winner, weights, dt = candidates[selection.best], selection.weights, self.intervals.dt
+        intervals, fit, impossible = search.likeliest.intervals, search.likeliest.refinement.fit, search.impossible
+        if winner.estimate is not None:
+            result, acting = with_parameters(intervals, fit, winner.estimate(), winner.parameters), None
+        else:
+            result, acting, impossible = self._of_blocks(winner, search.likeliest), winner.acting, ()
+        apart = np.array([x.parameters for x in candidates]) - winner.parameters
+        apart[weights == 0.0] = 0.0
+        result = replace(result, covariance=result.covariance + (weights * apart.T) @ apart / weights.sum())
+        rows = zip(candidates, selection.scores, selection.losses.tolist(), selection.as_good.tolist(), strict=True)
+        competitors = tuple(
+            Competitor(x.name, tuple(scores.errors.tolist()), loss, as_good, self._by_name(x))
+            for x, scores, loss, as_good in rows
+        )
+        summary = Competition(winner.name, tuple(float(n * dt) for n in selection.steps), competitors)
+        n_rows = selection.steps[int(np.argmin(selection.scores[selection.best].errors))]
+        decided = Decided(summary, acting, winner, n_rows)
+        return replace(search, motion=self.motion, result=result, decided=decided, impossible=impossible)
+
+    def _of_blocks(self, winner: Candidate, explanation: Explanation) -> ProjectedEstimate:
         """An estimate that no fit gave, with the covariance of the jackknife over blocks."""
-        intervals, fit = fit_of.intervals, fit_of.refinement.fit
-        covariance, stuck = jackknife(one.without), self.dataset.layout.on_bounds(one.parameters)
+        intervals, fit, p = explanation.intervals, explanation.refinement.fit, winner.parameters
+        covariance, stuck = jackknife(winner.without), self.dataset.layout.on_bounds(p)
         covariance[stuck] = covariance[:, stuck] = 0.0
         covariance[stuck, stuck] = np.inf
-        left = unexplained(intervals, fit, one.parameters)
-        n, k = len(one.parameters), fit.x.shape[1] + fit.d.shape[1]
-        of_z, of_s = np.zeros((len(intervals), k, n)), np.eye(len(fit.shared), n)
-        of_fit = fit.shared[:n]
-        return ProjectedEstimate(one.parameters, covariance, left, np.arange(len(intervals)), of_z, of_s, of_fit)
-
-    def _summary(self, judged: _Judgement) -> Competition:
-        """The comparison, for the result."""
-        names, c = self.dataset.layout.names, judged.comparison
-        rows = zip(self.candidates, judged.scores, c.losses, c.as_good, strict=True)
-        competitors = tuple(
-            Competitor(
-                one.name, tuple(x.errors.tolist()), float(loss), bool(as_good),
-                dict(zip(names, one.parameters.tolist(), strict=True)),
-            )
-            for one, x, loss, as_good in rows
-        )  # fmt: skip
-        return Competition(self.candidates[c.best].name, judged.judge.horizons, competitors)
+        of_z = np.zeros((len(intervals), fit.x.shape[1] + fit.d.shape[1], len(p)))
+        left, every, of_s = unexplained(intervals, fit, p), np.arange(len(intervals)), np.eye(len(fit.shared), len(p))
+        return ProjectedEstimate(p, covariance, left, every, of_z, of_s, fit.shared[: len(p)])
 
 
-def _estimates_of_fit(explanation: Explanation, acting: ActingInputs, blocks: Blocks) -> Iterator[Candidate]:
-    """Parameters read from a fit: by least squares on its motion over windows of each length, and its own."""
-    intervals, fit = explanation.intervals, explanation.refinement.fit
-    block = blocks.of_row[intervals.starts]
-    if not explanation.exact:
-        for seconds, estimate, parameters, parts in projected_candidates(intervals, fit):
-            if intervals.layout.violations(parameters) or not np.isfinite(parameters).all():
-                continue
-            name = f"least squares on the fitted motion, {seconds:.2g} s"
-            yield Candidate(
-                name, parameters, _left_out(parameters, parts, block, blocks.n), acting, intervals, estimate
-            )
-    own = fitted_parameters(intervals, fit)
-    steps = effect_of_intervals(intervals, fit).steps
-    without = _left_out(own.parameters, -steps, block, blocks.n)
-    yield Candidate("joint fit", own.parameters, without, acting, intervals, lambda: own)
-
-
-def _left_out(parameters: FloatArray, parts: FloatArray, block: IntArray, K: int) -> FloatArray:
-    """Parameters without each of K blocks, to first order, from the contribution of each interval to their error."""
-    sums = np.array([parts[block == k].sum(axis=0) for k in range(K)])
-    return np.asarray(parameters + K / (K - 1.0) * sums)
+def _best_other(candidates: Sequence[Candidate], selection: Selection) -> Candidate | None:
+    """The best estimate that no fit gave; None where a fit predicts better, or no estimate predicts."""
+    others = [k for k, x in enumerate(candidates) if x.estimate is None and selection.as_good[k]]
+    best = min(others, key=lambda k: selection.losses[k], default=None)
+    return None if best is None or not predicts(selection.scores[best].errors) else candidates[best]

@@ -1,9 +1,10 @@
 """Choice among estimates by predictions of blocks of the logs that they were not estimated from, in both directions.
 
 Forward, an estimate predicts the motion from the inputs (`forward`); inversely, the force that the measured motion
-needs (`inverse`).  Open loop alone does not judge a machine that is unstable or stuck in friction: a joint that is
-locked stays as well as the right one does, and needs a force that is not there.  Equations alone do not judge either:
-noise of a derivative attenuates what fits them best.
+needs: residuals of the equations at the motion that is smoothed without the model, averaged under bumps of a window's
+length, as rows of the weak form are.  Open loop alone does not judge a machine that is unstable or stuck in friction: a
+joint that is locked stays as well as the right one does, and needs a force that is not there.  Equations alone do not
+judge either: noise of a derivative attenuates what fits them best.
 
 References
 ----------
@@ -16,30 +17,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray
-from diransac.identification.methods.lo_diransac.forward import Forward, Prediction, means_of_known
-from diransac.identification.methods.lo_diransac.inverse import Inverse
+from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.identification.estimate import predicts
+from diransac.identification.methods.lo_diransac.forward import forward_predictions, means_of_known
+from diransac.identification.methods.lo_diransac.hypotheses import bump_of, firsts_of
+from diransac.identification.methods.lo_diransac.motion_equations import residuals_of_rows
+from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_states
 from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
     from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.methods.lo_diransac.forward import Reference
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
-    from diransac.identification.methods.lo_diransac.smoothing import Motion
-    from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
+    from diransac.identification.methods.lo_diransac.sources import Candidate
 
-_CLEARLY = 0.5
-"""Error of the best estimate over that of a trivial prediction, below which a horizon tells estimates apart."""
 _EXPLAINED = 0.25
-"""RMS of the force that the best estimate leaves over that of the force, below which an equation does: what fits noisy
-derivatives best is attenuated, and more noise would decide between estimates by that."""
-_ABSURD = 3.0
-"""Factor of the least force that is left, from which on an estimate fails absurdly that leaves more than the force."""
+"""RMS of the force that the best estimate leaves over that of the force, below which an equation tells estimates apart:
+what fits noisy derivatives best is attenuated, and more noise would decide between estimates by that."""
 _AS_WELL = 0.02
 """Difference of the logarithms of losses that does not count."""
-_NEGLIGIBLE, _ROUNDING = 1e-5, 1e-12
+_NEGLIGIBLE = 1e-5
 """Loss in comparison with which all are equal: three thousandths of the motion."""
+_ROUNDING = 1e-12
+"""Difference of the logarithms of losses that is rounding."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,13 +66,16 @@ class Scores:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison:
+class Selection:
     """Candidates in comparison, block by block, by the logarithm of their losses: no block decides alone.
 
     The loss of a block is the geometric mean of those of both directions, as far as they tell candidates apart.
 
     Parameters
     ----------
+    scores : sequence of Scores
+    steps : tuple of int
+        Horizons, rows.
     best : int
         Index of the winner: the first candidate that the best one does not beat by more than the noise of the
         comparison, nor by more than a fiftieth of its loss.
@@ -83,43 +89,65 @@ class Comparison:
         Geometric mean of the losses over the blocks; infinite for a candidate that fails absurdly.
     """
 
+    scores: Sequence[Scores]
+    steps: tuple[int, ...]
     best: int
     weights: FloatArray
     as_good: BoolArray
     losses: FloatArray
 
     @classmethod
-    def of(cls, scores: Sequence[Scores]) -> Comparison:
-        """Comparison of candidates."""
-        forces = np.array([x.forces for x in scores])
-        logs = _log_losses(scores, forces)
-        absurd = _fails_absurdly(forces)
-        logs[absurd & ~absurd.all()] = np.inf
-        first = int(np.argmin(_overall(logs)))
-        difference, error = _differences(logs, first)
+    def of(cls, scores: Sequence[Scores], steps: tuple[int, ...] = ()) -> Selection:
+        """The comparison of candidates."""
+        logs = _log_losses(scores)
+        likeliest = int(np.argmin(_overall(logs)))
+        difference, error = _differences(logs, likeliest)
         quantile = student_quantile(max(int(np.isfinite(logs).sum(axis=1).max()) - 1, 1), 0.975)
         as_well = difference <= np.minimum(quantile * error, _AS_WELL) + _ROUNDING
-        best = int(np.argmax(as_well | (np.arange(len(logs)) == first)))
+        best = int(np.argmax(as_well | (np.arange(len(logs)) == likeliest)))
         difference, error = _differences(logs, best)
         z = np.nan_to_num(np.maximum(difference - _AS_WELL, 0.0) / (error + _ROUNDING), nan=np.inf)
-        return cls(best, np.exp(-0.25 * np.square(z)), np.asarray(z <= quantile), np.exp(_overall(logs)))
+        weights, as_good = np.exp(-0.25 * np.square(z)), np.asarray(z <= quantile)
+        return cls(scores, steps, best, weights, as_good, np.exp(_overall(logs)))
 
 
-def _log_losses(scores: Sequence[Scores], forces: FloatArray) -> FloatArray:
+def judge(reference: Reference, candidates: Sequence[Candidate], horizon: float | None = None) -> Selection | None:
+    """Comparison of candidates; None where the logs are too short for one, or nothing is predicted.
+
+    ``horizon`` is in s; None: several, from the time scales of the motion up to a whole log.
+    """
+    predictions = forward_predictions(reference, horizon)
+    if not (candidates and predictions):
+        return None
+    scores, forces = [], forces_left(reference, candidates)
+    for parts, left in zip(zip(*(x.compared(candidates) for x in predictions), strict=True), forces, strict=True):
+        errors, losses = map(np.concatenate, zip(*parts, strict=True))
+        scores.append(Scores(errors, losses, left))
+    if not any(np.isfinite(x.losses).any() for x in scores):
+        return None
+    return Selection.of(scores, tuple(n for x in predictions for n in x.steps))
+
+
+def _log_losses(scores: Sequence[Scores]) -> FloatArray:
     """Logarithms ``(n, n_blocks)`` of the losses of both directions, as far as they tell candidates apart.
 
     Over other horizons an unstable machine is lost, and estimates that respond less to their inputs have the smaller
     errors.  Where no horizon tells them apart, all of them count.  Where all of the motion is predicted, forces do not
-    count: their errors are those of smoothing.
+    count: their errors are those of smoothing.  The losses are infinite of candidates that fail absurdly: that need far
+    more force in an equation than there is, and than another one.
     """
-    least = np.fmin.reduce([x.errors for x in scores])
-    told = least < _CLEARLY if (least < _CLEARLY).any() else least < np.inf
-    logs = _log_means(np.array([x.losses[told] for x in scores]))
-    telling = np.fmin.reduce(means_of_known(forces)) < _EXPLAINED**2
-    if not telling.any() or np.exp(_overall(logs)).min() < 2.0 * _NEGLIGIBLE:
-        return logs
-    inverse = _log_means(np.log1p(forces[:, telling]))
-    return np.asarray(0.5 * (logs + np.where(np.isfinite(inverse), inverse, logs)))
+    errors, forces = np.fmin.reduce([x.errors for x in scores]), np.array([x.forces for x in scores])
+    horizons = [bool(predicts([x])) for x in errors] if predicts(errors) else errors < np.inf
+    logs = _log_means(np.array([x.losses[horizons] for x in scores]))
+    left = np.sqrt(means_of_known(forces))
+    least = np.fmin.reduce(left)
+    equations = least < _EXPLAINED
+    if equations.any() and np.exp(_overall(logs)).min() >= 2.0 * _NEGLIGIBLE:
+        inverse = _log_means(np.log1p(forces[:, equations]))
+        logs = 0.5 * (logs + np.where(np.isfinite(inverse), inverse, logs))
+    absurd = (left > np.maximum(3.0 * least, 1.0)).any(axis=1)
+    logs[absurd & ~absurd.all()] = np.inf
+    return logs
 
 
 def _log_means(losses: FloatArray) -> FloatArray:
@@ -127,84 +155,68 @@ def _log_means(losses: FloatArray) -> FloatArray:
     return np.asarray(np.log(means_of_known(losses.swapaxes(1, 2)) + _NEGLIGIBLE))
 
 
-def _fails_absurdly(forces: FloatArray) -> BoolArray:
-    """Mask ``(n,)`` of the candidates that need far more force in an equation than there is, and than another one."""
-    left = np.sqrt(means_of_known(forces))
-    return np.asarray((left > np.maximum(_ABSURD * np.fmin.reduce(left), 1.0)).any(axis=1))
-
-
 def _overall(logs: FloatArray) -> FloatArray:
     """Mean over the blocks that are known; infinite where a candidate has none, or fails."""
     return np.asarray(np.where(np.isinf(logs).any(axis=1), np.inf, np.nan_to_num(means_of_known(logs), nan=np.inf)))
 
 
-def _differences(scores: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:
+def _differences(logs: FloatArray, reference: int) -> tuple[FloatArray, FloatArray]:
     """Mean difference ``(n,)`` of the losses from those of one candidate, and its standard error, by blocks."""
-    apart = scores - scores[reference]
+    apart = logs - logs[reference]
     n, mean = np.isfinite(apart).sum(axis=1), means_of_known(apart)
     return mean, np.sqrt(means_of_known(np.square(apart - mean[:, None])) / np.maximum(n - 1, 1))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Judge:
-    """Both directions of prediction, of the same blocks.
+# ---------------------------------------------------------------------- forces
 
-    Parameters
-    ----------
-    forward : tuple of Forward
-        Segments over the time scales of the motion, and whole logs where they can be simulated at once.
-    inverse : Inverse
+
+def forces_left(reference: Reference, candidates: Sequence[Candidate]) -> list[FloatArray]:
+    """Mean squares ``(n_equations, n_blocks)`` of the force that the equations leave in each block, over the force.
+
+    Each by the candidate's estimate without the block.  The force of an equation is the larger one of inertial force
+    and force of the inputs, as the middle of the candidates has it; an equation without any is left out.
     """
-
-    forward: tuple[Forward, ...]
-    inverse: Inverse
-
-    @classmethod
-    def of(
-        cls,
-        acting: ActingInputs,
-        intervals: ShootingIntervals,
-        motion: Motion,
-        inlying: BoolArray,
-        noise: FloatArray,
-        blocks: Blocks,
-        horizon: float | None,
-    ) -> Judge | None:
-        """The judge of some logs; None where these are too short, or no predicted sample is known.
-
-        ``horizon`` is in s; None: several, from the time scales of the motion up to a whole log.
-        """
-        given = acting, intervals, motion, inlying, noise, blocks
-        found = [Forward.of(*given, horizon)]
-        if horizon is None:
-            found.append(Forward.of_whole_logs(*given))
-        known = tuple(x for x in found if x is not None)
-        return cls(known, Inverse.of(intervals, motion, blocks)) if known else None
-
-    @property
-    def horizons(self) -> tuple[float, ...]:
-        """Horizons of the predictions, s."""
-        return tuple(h for one in self.forward for h in one.horizons)
-
-    @property
-    def steps(self) -> tuple[int, ...]:
-        """Horizons of the predictions, rows."""
-        return tuple(n for one in self.forward for n in one.steps)
-
-    def compared(self, candidates: Sequence[Candidate]) -> tuple[Judge, list[Scores]]:
-        """The judge without the samples that no good candidate predicts, and its scores of all candidates."""
-        pairs = [one.compared(candidates) for one in self.forward]
-        fair = Judge(tuple(x for x, _ in pairs), self.inverse)
-        forces = self.inverse.forces_left(candidates)
-        predicted = zip(*(x for _, x in pairs), strict=True)
-        return fair, [_joined(*some) for some in zip(predicted, forces, strict=True)]
-
-    def scores(self, candidate: Candidate) -> Scores:
-        """Predictions of a candidate, each segment by its estimate without the blocks of the segment."""
-        return _joined([one.scores(candidate) for one in self.forward], self.inverse.forces_left([candidate])[0])
+    intervals, blocks = reference.intervals, reference.blocks
+    equations = equations_of_measured_states(intervals)
+    firsts = np.concatenate([firsts_of(intervals, x) for x in intervals.rows_of_logs])
+    if not (len(equations) and len(firsts)):
+        return [np.empty((0, blocks.n))] * len(candidates)
+    block, left, sizes = blocks.of_row[firsts + intervals.length // 2], [], []
+    for candidate in candidates:
+        with np.errstate(all="ignore"):
+            means = _mean_residuals(reference, candidate, firsts, equations)
+            sizes.append(np.var([means[0] - means[1], means[0] - means[2]], axis=1).max(axis=0))
+            parts = [np.square(means[0, block == k]) for k in range(blocks.n)]
+            squares = np.array([x.mean(axis=0) if len(x) else np.full(len(equations), np.nan) for x in parts]).T
+        left.append(np.nan_to_num(squares, nan=np.nan, posinf=1e200))
+    size = np.median(sizes, axis=0)
+    used = np.isfinite(size) & (size > 0.0)
+    return [x[used] / size[used, None] for x in left]
 
 
-def _joined(predicted: Sequence[Prediction], forces: FloatArray) -> Scores:
-    """Scores from errors and losses by horizon of each kind of prediction, and the forces that are left."""
-    errors, losses = zip(*predicted, strict=True)
-    return Scores(np.concatenate(errors), np.concatenate(losses), forces)
+def _mean_residuals(reference: Reference, candidate: Candidate, firsts: IntArray, equations: IntArray) -> FloatArray:
+    """Means ``(3, K, n_equations)`` of residuals under bumps: as they are, without inertia, and without inputs."""
+    intervals, model, u = reference.intervals, reference.intervals.model, _between(candidate.acting)
+    q, v, a, _ = reference.motion.parts(model, slice(None))
+    p = candidate.without[reference.blocks.of_row]
+    if not intervals.layout.is_shared:
+        p = np.take_along_axis(p, intervals.layout.index[intervals.log_of_row], axis=1)
+    forces = ((a, u), (np.zeros_like(a), u), (a, np.zeros_like(u)))
+    rows = np.array([residuals_of_rows(model, q, v, x, w, p)[:, equations] for x, w in forces])
+    windows = np.lib.stride_tricks.sliding_window_view(rows, intervals.length, axis=1)
+    return np.asarray(windows[:, firsts] @ bump_of(intervals.length))
+
+
+def _between(acting: ActingInputs) -> FloatArray:
+    """Inputs ``(N, n_u)`` around the instant of each row, at which accelerations are those between two held inputs."""
+    u = acting.values
+    return 0.5 * (u + np.concatenate([u[:1], u[:-1]])) if acting.hold == "zero-order" else u
+
+
+def equations_of_measured_states(intervals: ShootingIntervals) -> IntArray:
+    """Equations in which no unmeasured state enters, nor a derivative of it."""
+    model, unmeasured = intervals.model, unmeasured_states(intervals)
+    hidden = [name for chain in model.chains if not set(unmeasured).isdisjoint(chain) for name in chain]
+    names = (*model.coordinates, *model.velocities, *model.accelerations)
+    enters = np.hstack([np.array(ca.DM(model.residual.sparsity_jac(k, 0), 1)) != 0.0 for k in range(3)])
+    return np.flatnonzero(~enters[:, np.isin(names, hidden)].any(axis=1))

@@ -42,7 +42,6 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.columns import FITTED_MOTION
-from diransac.identification.structure.equivalents import is_close
 from diransac.identification.structure.free_units import KnownUpTo, known_up_to_units
 from diransac.identification.structure.refusal import check_signs
 from diransac.identification.structure.structural import check_structure, unidentifiable
@@ -97,8 +96,6 @@ class LoDiransac(LoDiransacSettings):
         Prior size of the unmodelled accelerations, over the spread of the accelerations.
     prior_discrepancy : float, optional
         Prior size of input gain and bias discrepancies, over that which equals an equation's inertial force.
-    sources : sequence of str, optional
-        Sources of estimates besides the joint fit: "least squares", "simulation error".
     start : mapping of str to float, optional
         Values of parameters, each in its unit, from which simulation error starts, too.
     horizon : float, optional
@@ -234,7 +231,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
-        *_checks_of_unmeasured(dataset, best),
+        *_checks_of_unmeasured(best),
         *findings_of_fit(likeliest, best.decided.acting if best.decided else None),
         *parts.findings,
     )
@@ -280,9 +277,9 @@ def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
         )
 
 
-def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding]:
-    """Findings where nothing measures a state, so that a search is doubtful, or other parameters are as good."""
-    layout, names = dataset.layout, unmeasured_by_name(found.likeliest.intervals)
+def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
+    """Findings where nothing measures a state, so that a search is doubtful."""
+    names = unmeasured_by_name(found.likeliest.intervals)
     if found.is_doubtful:
         share = 100.0 * found.unexplained
         yield Finding(
@@ -290,16 +287,6 @@ def _checks_of_unmeasured(dataset: Dataset, found: Searched) -> Iterator[Finding
             f"Nothing measures {names}, and the model leaves {share:.2g} % of an acceleration unexplained, and the log "
             "does not tell them apart",
             f"measure {names}",
-        )
-    for other in found.as_likely[:1]:
-        pairs = zip(layout.names, other.tolist(), is_close(other, found.result.parameters), strict=True)
-        changed = {n: x for n, x, close in pairs if not close}
-        values = ", ".join(f"{n} = {x:.4g}" for n, x in changed.items())
-        verb = "explain" if found.decided is None else "may explain"
-        yield Finding(
-            "bad",
-            f"Since nothing measures {names}, {values} {verb} this log as well",
-            f"bound {' or '.join(changed)}, or measure {names}",
         )
 
 

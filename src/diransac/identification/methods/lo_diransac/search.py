@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ from diransac.errors import IdentificationError, TimeLimitError
 from diransac.identification.core.minimise import diverges, make_prior, start
 from diransac.identification.method import report, within
 from diransac.identification.methods.lo_diransac.hypotheses import find_hypotheses
-from diransac.identification.methods.lo_diransac.local_search import AS_LIKELY, LATE, LocalSearch
+from diransac.identification.methods.lo_diransac.local_search import LATE, LocalSearch
 from diransac.identification.methods.lo_diransac.motion_equations import discrepancy_units, residuals_of_motion
 from diransac.identification.methods.lo_diransac.projection import (
     ProjectedEstimate,
@@ -24,17 +23,13 @@ from diransac.identification.methods.lo_diransac.projection import (
 )
 from diransac.identification.methods.lo_diransac.recording_errors import LEAST_DELAY, errors_of
 from diransac.identification.methods.lo_diransac.unmeasured import (
-    measured_signals,
     unmeasured_by_name,
     unmeasured_states,
     with_observed_states,
-    with_simulated_states,
     with_unmeasured_states,
 )
 from diransac.identification.regression.rows import MotionRows
-from diransac.identification.structure.equivalents import equivalent_parameters, is_close
 from diransac.identification.structure.refusal import cause_of_refusal
-from diransac.identification.structure.structural import structural
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -75,8 +70,7 @@ class Searched:
     """The likeliest explanation of the logs, and the motion that its search began with.
 
     ``decided`` is the outcome of a competition; None where there was none.  ``impossible`` names parameters that would
-    violate a strict bound by least squares of the whole motion; the result is that of the fit then.  ``as_likely`` are
-    other parameters (n,) that explain the logs as well, or that have the answer's response and predict nearly as well.
+    violate a strict bound by least squares of the whole motion; the result is that of the fit then.
     """
 
     motion: Motion
@@ -86,7 +80,6 @@ class Searched:
     result: ProjectedEstimate
     impossible: tuple[str, ...]
     decided: Decided | None = None
-    as_likely: tuple[FloatArray, ...] = ()
 
     @cached_property
     def common_timing(self) -> RecordingError | None:
@@ -198,36 +191,6 @@ def likeliest(
     except (IdentificationError, np.linalg.LinAlgError):
         pass  # the search before stands
     return best
-
-
-def equivalents_of(dataset: Dataset, intervals: ShootingIntervals, parameters: FloatArray) -> list[FloatArray]:
-    """Other admissible parameters that have the transfer function of given ones.
-
-    Where all states are measured, equations of motion determine the parameters, and there are none.
-    """
-    model, layout, signals = dataset.model, dataset.layout, measured_signals(intervals)
-    if not unmeasured_states(intervals) or not layout.is_shared or structural(model, signals, dataset.ranges):
-        return []
-    found = equivalent_parameters(model, parameters, signals, dataset.ranges)
-    return [p for p in found if layout.admits(p[None])[0]]
-
-
-def with_equivalents(
-    settings: LoDiransacSettings, dataset: Dataset, found: Searched, seed: int, callback: Callback | None
-) -> Searched:
-    """The likeliest of a search and of further ones, from parameters with the transfer function of its estimate."""
-    intervals, every = found.likeliest.intervals, [found]
-    try:
-        for p in equivalents_of(dataset, intervals, found.result.parameters):
-            begin, further = with_simulated_states(intervals, found.motion, p), within(callback, 0.895, 0.9)
-            with suppress(IdentificationError, np.linalg.LinAlgError):
-                every.append(searched(settings, intervals, begin, found.notes, seed, dataset, further, p[None]))
-    except TimeLimitError:
-        return replace(found, likeliest=replace(found.likeliest, complete=False))
-    best = min(every, key=lambda x: x.likeliest.cost)
-    own = best.result.parameters
-    others = [x.result.parameters for x in every if x.likeliest.cost < best.likeliest.cost + AS_LIKELY]
-    return replace(best, as_likely=tuple(p for p in others if not is_close(p, own).all()))
 
 
 def searched(

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from diransac.identification.structure.candidate_terms import TermLibrary
     from diransac.model import Model
 
-SOURCES = ("least squares", "simulation error")
-"""Sources of estimates besides the samples of the weak form and the joint fit that begins with them."""
-
 
 @dataclass(frozen=True)
 class LoDiransacSettings:
@@ -40,7 +37,6 @@ class LoDiransacSettings:
     model_error: bool = True
     prior_model_error: float = 1e-3
     prior_discrepancy: float = 0.1
-    sources: tuple[str, ...] = SOURCES
     start: Mapping[str, float] | None = None
     horizon: float | None = None
     suggestions: bool = True
@@ -61,9 +57,6 @@ class LoDiransacSettings:
             elif f.name not in (*_OBJECTS, *_SWITCHES):
                 object.__setattr__(self, f.name, _checked(f.name, value, f.default))
         check_substeps(self.substeps)
-        unknown = [x for x in self.sources if x not in SOURCES]
-        if unknown:
-            raise SettingsError(f"sources names {unknown[0]!r}; there are {', '.join(SOURCES)}")
         if self.horizon is not None:
             object.__setattr__(self, "horizon", _checked("horizon", self.horizon, 1.0))
         _check_start(self.start)
@@ -116,7 +109,7 @@ def _check_start(start: object) -> None:
 
 _OBJECTS = ("criteria", "candidate_terms", "start", "horizon")
 _SWITCHES = ("input_delay", "input_lag")
-_NAMES = ("sources", "sensor_delays", "sensor_biases", "gain_drifts")
+_NAMES = ("sensor_delays", "sensor_biases", "gain_drifts")
 _MAY_BE_ZERO = (
     "n_samples",
     "max_steps",
@@ -143,10 +136,9 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 def _checked_names(name: str, value: Any) -> tuple[str, ...] | None:
     """Names of signals or inputs; one name stands for itself.  Raises SettingsError: a value is no name."""
     names = (value,) if isinstance(value, str) else value
-    by_evidence = name != "sources"
-    if names is None and by_evidence:
+    if names is None:
         return None
     if not isinstance(names, list | tuple) or not all(isinstance(x, str) for x in names):
-        wanted = "signals, () for none, or None for the clear ones" if by_evidence else "sources, or () for none"
+        wanted = "signals, () for none, or None for the clear ones"
         raise SettingsError(f"{name} is {value!r}; give names of {wanted}")
     return tuple(names)

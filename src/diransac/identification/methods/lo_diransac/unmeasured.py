@@ -141,25 +141,6 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     return _best(intervals, motion, problem, z[np.isfinite(cost)])
 
 
-def with_simulated_states(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray) -> Motion:
-    """The motion with unmeasured states that start at zero, and their derivatives, as parameters ``(n,)`` give them.
-
-    Parameters
-    ----------
-    intervals : ShootingIntervals
-    motion : Motion
-        Smoothed motion over the rows of the intervals.
-    parameters : (n,) array
-        Each in its unit.
-
-    Returns
-    -------
-    Motion
-    """
-    problem = _driven(intervals, motion)
-    return _completed(motion, problem, np.append(parameters, problem.begin))
-
-
 def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
     """The motion of observers that follow the samples, of measured states and of others.
 
