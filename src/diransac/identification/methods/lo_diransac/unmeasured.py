@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, robust_std
+from diransac.arrays import BoolArray, FloatArray
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
+from diransac.identification.methods.lo_diransac.mixture import lower_scale
 from diransac.identification.methods.lo_diransac.smoothing import Motion
+from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,8 +31,6 @@ DRIVEN = ((0.25, 15, 12), (0.25, 60, 12))
 smoothed motion average out, steps, and the number of starts that go on."""
 OBSERVED = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, 12))
 """Stages of observers that follow the samples, which become simulations."""
-OUTLYING = 5.0
-"""Distance of a sample from the smoothed motion that makes it an outlier, standard deviations."""
 
 
 def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
@@ -211,8 +211,8 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     columns = [model.signals.index(n) for n in (*sampled, *model.sensors)]
     smoothed, known = motion.signals[:, columns], intervals.known[:, columns]
     apart = np.where(known, np.abs(intervals.measured[:, columns] - smoothed), 0.0)
-    noise = np.array([robust_std(x[i]) if i.any() else 0.0 for x, i in zip(apart.T, known.T, strict=True)])
-    inlying = known & (apart < OUTLYING * noise + 1e-9)
+    noise = np.nan_to_num(lower_scale(apart, known))
+    inlying = known & (apart < CLEAR * noise + 1e-9)
     values = np.where(inlying, intervals.measured[:, columns], np.nan_to_num(smoothed))
     weights = np.where(inlying, 1.0 / np.square(noise + 1e-9), 0.0) / max(inlying.sum(), 1)
     first = np.array([rows.start for rows in intervals.rows_of_logs])
