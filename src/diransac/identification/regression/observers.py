@@ -36,14 +36,10 @@ from diransac.model import Model, Parameter
 from diransac.model.derivation import Symbols
 from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 
-STARTS = 256
-"""Starts at most; four to the power of the number of parameters where these are fewer."""
 STRETCH = 2000
 """Rows of all logs that are enough to find starts; a quarter of it of each of many logs."""
 NUMBERS = 200_000_000
 """Rows times pairs of unknowns times starts at most, which bounds the time of a step."""
-CREEPING = 1e-5
-"""Relative decrease of the cost in a step from which on a start goes on."""
 
 
 @lru_cache(maxsize=32)
@@ -173,7 +169,7 @@ class ObserverFit:
         if self.parameters is not None:
             return self.begin.reshape(1, -1)
         n_rows, n_unknowns = sum(x.stop - x.start for x in self.rows_of_logs), len(self.layout) + self.begin.size
-        n = min(STARTS, 4 ** len(self.layout), NUMBERS // (n_rows * n_unknowns**2))
+        n = min(4 ** min(len(self.layout), 4), NUMBERS // (n_rows * n_unknowns**2))
         chart = ParameterChart(self.layout.bounds)
         return self._begun(chart.to_parameters(chart.starts(max(16, n))))
 
@@ -189,14 +185,15 @@ class ObserverFit:
         stages : sequence of (float, int, int)
             Bandwidth, 1/s, number of steps, and of the starts that go on; the first over a stretch of each long log.
         """
-        z, cost, fit = np.empty((0, 0)), np.empty(0), self
-        for k, (bandwidth, n_steps, n_kept) in enumerate(stages):
-            fit = replace(self, bandwidth=bandwidth)
-            some = fit if k else fit.on_stretches()
-            z, cost = least_squares(some, z if k else some.starts(), n_steps, 1e-9 if k else CREEPING)
+        problem = self.on_stretches()
+        z, cost = problem.starts(), np.empty(0)
+        for bandwidth, n_steps, n_kept in stages:
+            # A start goes on while a step lowers its cost by so much.
+            z, cost = least_squares(replace(problem, bandwidth=bandwidth), z, n_steps, 1e-5)
             best = np.argsort(cost, kind="stable")[:n_kept]
-            z, cost = z[best] if some is fit else fit._begun(z[best]), cost[best]
-        return fit, z[np.isfinite(cost)]
+            z, cost = z[best] if problem is self else self._begun(z[best]), cost[best]
+            problem = self
+        return replace(self, bandwidth=stages[-1][0]), z[np.isfinite(cost)]
 
     def on_stretches(self) -> ObserverFit:
         """The same on a part of each long log, in which its inputs change most; samples are where states start from."""

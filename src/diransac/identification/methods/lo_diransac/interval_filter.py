@@ -36,8 +36,6 @@ STEPS = {"state": 1e-7, "parameter": 1e-5, "delay": 1e-6}
 """Local differences, over the size of a state or parameter, samples of a delay: wider ones meet other contacts."""
 START_STD = {"m": 0.05, "1": 0.05}
 """Standard deviation of an unmeasured coordinate at the start by unit, others 0.3; of its velocity ten times that."""
-FIRST_LACK = 0.3
-"""Change of a velocity in an interval that the model lacks at first, over the change that it predicts."""
 CURVED = 4.0
 """Mean variance that divided differences leave, over that of the noise: above, local slopes are used."""
 SETTLING = 8
@@ -296,7 +294,7 @@ class IntervalFilter:
     intervals : ShootingIntervals
     noise : Mixture
     lack : float
-        Change of a velocity in an interval that the model lacks, over the change that it predicts.
+        Change of a velocity in an interval that the model lacks, over the change that it predicts; at first a third.
     delay : float
         Of the inputs, samples.
     free_delay : bool
@@ -308,7 +306,7 @@ class IntervalFilter:
 
     intervals: ShootingIntervals
     noise: Mixture
-    lack: float = FIRST_LACK
+    lack: float = 0.3
     delay: float = 0.0
     free_delay: bool = True
     spread: FloatArray | None = None

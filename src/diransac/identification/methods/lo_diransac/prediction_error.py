@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, "Minimum"], None] | None
 
-PASSES = {"local": 30, "spread": 12}
-"""Passes with slopes at a point, and over the spread, at most."""
+PASSES = 30
+"""Passes with local slopes at most; over the spread, three times the latest."""
 LATEST = 4
 """Passes that decide whether a fit has ended, and how far an estimate wanders; halvings of a step in a row."""
 CONVERGED = 0.5
@@ -100,7 +100,7 @@ def minimised(kalman: IntervalFilter, p: FloatArray, *, outliers: bool, progress
     Minimum
     """
     latest, now, reach = list[Minimum](), kalman.over_logs(p), 1.0
-    for k in range(PASSES["local"]):
+    for k in range(PASSES):
         held = kalman.free_delay and k < LATEST - 1  # it would stand for wrong parameters
         latest = [*latest, _after(kalman, p, now, held=held)][-LATEST:]
         found = replace(latest[-1], covariance=_covariance(latest))
@@ -146,7 +146,7 @@ def over_spread(local: Minimum, *, outliers: bool, progress: Progress = None) ->
     latest, now, is_likelier, converged = list[Minimum](), kalman.over_logs(p), False, False
     if np.abs(now.losses - local.last.losses).sum() < 1.0 or is_worse(now.losses, local.last.losses):
         return local
-    for k in range(PASSES["spread"]):
+    for k in range(3 * LATEST):
         end = _after(kalman, p, now)
         is_near = np.abs(end.unknowns - local.unknowns) <= CLEAR * errors
         end = replace(end, covariance=widened(end.covariance, np.where(is_near, errors, 0.0)))
