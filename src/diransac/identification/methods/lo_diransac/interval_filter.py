@@ -34,8 +34,6 @@ RADIUS = 3.0**0.5
 """Distance of the points of divided differences from the mean, standard deviations: by a Gaussian's kurtosis."""
 STEPS = {"state": 1e-7, "parameter": 1e-5, "delay": 1e-6}
 """Local differences, over the size of a state or parameter, samples of a delay: wider ones meet other contacts."""
-START_STD = {"m": 0.05, "1": 0.05}
-"""Standard deviation of an unmeasured coordinate at the start by unit, others 0.3; of its velocity ten times that."""
 CURVED = 4.0
 """Mean variance that divided differences leave, over that of the noise: above, local slopes are used."""
 SETTLING = 8
@@ -347,15 +345,16 @@ class IntervalFilter:
 
     @cached_property
     def start_std(self) -> FloatArray:
-        """Standard deviation ``(n_x,)`` of the first state."""
-        model, n_x = self.intervals.model, self.intervals.model.n_q + self.intervals.model.n_v
+        """Standard deviation ``(n_x,)`` of the first state: 0.3 rad, 5 cm, the range of an input, or a noisy sample's.
+
+        Of a velocity ten times that in a second.
+        """
+        model, seen = self.intervals.model, np.asarray(self.intervals.known.any(axis=0))
         units = [*model.coordinates.values(), *(x.partition("/")[0] for x in model.velocities.values())]
-        std = np.array([START_STD.get(x, 0.3) for x in units])
-        std[model.n_q :] *= 10.0
+        std = np.where(np.isin(units, ["m", "1"]), 0.05, 0.3) * np.where(np.arange(len(units)) < model.n_q, 1.0, 10.0)
         driven = np.isin(model.state, list(model.first_order))
         std[driven] = np.maximum(std[driven], np.ptp(self.intervals.recorded, axis=0).max(initial=0.0))
-        seen: BoolArray = np.asarray(self.intervals.known.any(axis=0))
-        return np.where(seen[:n_x], np.minimum(self.noise.sigma[:n_x] + 0.03 * std, std), std)
+        return np.where(seen[: len(std)], np.minimum(self.noise.sigma[: len(std)] + 0.03 * std, std), std)
 
     def first_state(self, w: int, rest: FloatArray) -> FloatArray:
         """State at an interval's start: medians of the first five samples, of what nothing measures the rest."""
@@ -401,7 +400,7 @@ class _Run:
         self.done = FilterPass(
             np.zeros(W), lost, scores, information, states, np.zeros((W, n_x)), residuals, np.full(W, np.nan)
         )
-        self.age, self.contradicts = 0, np.zeros(1, bool)
+        self.age, self.contradicts = 0, False
         noise, k = of.noise, of.columns
         self.noise = Mixture(noise.sigma[k], noise.pi[k], noise.span[k], noise.floor[k])
         spread = of.spread
@@ -479,25 +478,15 @@ class _Run:
         wide = np.sqrt(1.0 + expected / np.square(self.noise.sigma))
         losses, inlying = self.noise.losses_and_inlying(errors / wide, known)
         done.losses[w] = float((losses + known * np.log(wide)).sum())
-        before, self.contradicts = self.contradicts, self.contradicting(inlying, known)
+        # Too few samples agree, in two intervals: the motion is lost, and begins anew with the samples.
+        before, self.contradicts = self.contradicts, bool(inlying.sum() < 0.5 * known.sum())
         update = self.updated(w, state, belief, linear, inlying / np.square(self.noise.sigma))
         self.count(w, update, belief, float(inlying.sum()))
         done.states[w] = state + update.moved
         done.residuals[rows, columns] = np.where(known, linear.sampled(update.values, len(columns)), 0.0)
         end = update.values[-len(state) :]
-        is_lost = bool((self.contradicts & before).any()) and bool(self.of.intervals.following[w])
+        is_lost = self.contradicts and before and bool(self.of.intervals.following[w])
         return end, None if is_lost else self.lacking(w, update, linear)
-
-    def contradicting(self, inlying: FloatArray, known: BoolArray) -> BoolArray:
-        """Mask of signals of which too few samples agree; all of them if too few of all do.
-
-        An update may lose a state alone.  It counts if it was followed, is not an outlier mostly, and if all
-        coordinates are measured, so that nothing is forgotten.
-        """
-        columns, n_q = self.of.columns, self.of.intervals.model.n_q
-        few = inlying.sum(axis=0) < 0.5 * known.sum(axis=0)
-        alone = (columns < self.done.states.shape[1]) & (self.noise.pi <= 0.5) & (np.sum(columns < n_q) == n_q)
-        return np.asarray((few & alone & (self.age > SETTLING)) | (inlying.sum() < 0.5 * known.sum()))
 
     def updated(self, w: int, state: FloatArray, belief: Belief, linear: LinearInterval, weights: FloatArray) -> Update:
         """Update by an interval's samples with as much weight as their linear model deserves.

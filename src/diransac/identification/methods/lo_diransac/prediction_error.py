@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diransac.arrays import FloatArray
-from diransac.identification.methods.lo_diransac.interval_filter import START_STD, FilterPass, IntervalFilter, widened
+from diransac.identification.methods.lo_diransac.interval_filter import FilterPass, IntervalFilter, widened
 from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
@@ -266,8 +266,5 @@ def _bounds_of_step(kalman: IntervalFilter, p: FloatArray, *, held: bool = False
     for j, bounds in enumerate(kalman.intervals.layout.bounds):
         if p[j] > 0.0 and (bounds.positive or bounds.lower == 0.0):
             low[j], high[j] = max(low[j], -0.5 * p[j]), min(high[j], p[j])
-        elif bounds.unit in START_STD:
-            reach = max(START_STD[bounds.unit], abs(p[j]))
-            low[j], high[j] = max(low[j], -reach), min(high[j], reach)
     late = [0.0 if held else 1.0] * kalman.free_delay
     return np.append(low, np.negative(late)), np.append(high, late)
