@@ -134,7 +134,7 @@ def test_an_update_is_that_of_bayes_with_what_slopes_leave_as_noise():
     np.testing.assert_allclose(update.belief.covariance, covariance, atol=1e-9)
     np.testing.assert_allclose(update.information, of_p.T @ S @ of_p)
     np.testing.assert_allclose(update.score, -of_p.T @ S @ errors)
-    np.testing.assert_allclose(update.values[ROWS:], linear.end - end @ unknown.T @ S @ errors)
+    np.testing.assert_allclose(update.values[ROWS:], linear.values[ROWS:] - end @ unknown.T @ S @ errors)
     covariance = end @ (np.eye(2 * N_X) - unknown.T @ S @ unknown) @ end.T
     np.testing.assert_allclose(update.belief_of_end.covariance, covariance, atol=1e-9)
 

@@ -106,11 +106,6 @@ class LinearInterval:
         """True if slopes are those at the state, and leave nothing."""
         return bool(self.of_unknown.shape[1] == len(self.of_velocities))
 
-    @property
-    def end(self) -> FloatArray:
-        """State ``(n_x,)`` after the last row."""
-        return self.values[-len(self.of_velocities) :]
-
     def sampled(self, values: FloatArray, n_signals: int) -> FloatArray:
         """The part of an array ``(m + n_x, ...)`` that is of samples, ``(n_rows, n_signals, ...)``."""
         n_x = len(self.of_velocities)
@@ -215,12 +210,6 @@ class FilterPass:
     def loss(self) -> float:
         """Negative log-likelihood of all samples."""
         return float(self.losses.sum())
-
-    def bounded(self) -> FilterPass:
-        """The pass with intervals of bounded influence."""
-        weights = bounded_influence(self.information)
-        scores, information = weights[:, None] * self.scores, weights[:, None, None] * self.information
-        return replace(self, scores=scores, information=information)
 
     def step(self, precision: FloatArray, pull: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FloatArray:
         """Gauss-Newton step ``(n,)`` with priors, within bounds of it; 0 where the logs tell nothing.
@@ -376,7 +365,9 @@ class IntervalFilter:
                 belief = Belief(np.diag(np.square(self.start_std)), np.zeros((len(state), run.n)))
                 run.age = 0
             state, belief = run.interval(w, state, belief)
-        return run.done.bounded()
+        weights = bounded_influence(run.done.information)
+        scores, information = weights[:, None] * run.done.scores, weights[:, None, None] * run.done.information
+        return replace(run.done, scores=scores, information=information)
 
     def trajectories(self, p: FloatArray, states: FloatArray) -> FloatArray:
         """All signals ``(N, n_signals)`` of the intervals from states ``(W, n_x)`` at their starts."""
@@ -403,11 +394,11 @@ class _Run:
         self.age, self.contradicts = 0, False
         noise, k = of.noise, of.columns
         self.noise = Mixture(noise.sigma[k], noise.pi[k], noise.span[k], noise.floor[k])
-        spread = of.spread
+        self.known = intervals.known[:, k].reshape(W, intervals.length, -1)
         self.root = None
-        if spread is not None:  # the delay is uncorrelated
-            self.root = np.diag(np.sqrt(np.diag(spread)))
-            self.root[: len(p), : len(p)] = np.linalg.cholesky(spread[: len(p), : len(p)])
+        if of.spread is not None:  # the delay is uncorrelated
+            self.root = np.diag(np.sqrt(np.diag(of.spread)))
+            self.root[: len(p), : len(p)] = np.linalg.cholesky(of.spread[: len(p), : len(p)])
         sizes = np.array([abs(x.value or 0.0) or 0.01 for x in intervals.layout.bounds])
         self.steps = np.append(STEPS["parameter"] * np.maximum(sizes, np.abs(p)), [STEPS["delay"]] * of.free_delay)
         # Recordings with the delay, a local step more, and the spread of it more and less, one after another.
@@ -444,31 +435,25 @@ class _Run:
             ahead = RADIUS * belief.directions(self.root).T
             points = np.vstack([np.zeros(len(ahead)), ahead, -ahead])
             lower, upper = np.array([(x.lower, x.upper) for x in self.of.intervals.layout.bounds]).T
-            within = np.clip(points[:, n_x : n_x + len(self.p)], lower - self.p, upper - self.p)
-            points[:, :n_x] += (within - points[:, n_x : n_x + len(self.p)]) @ belief.slopes[:, : len(self.p)].T
-            points[:, n_x : n_x + len(self.p)] = within
+            of_p = points[:, n_x : n_x + len(self.p)]
+            within = np.clip(of_p, lower - self.p, upper - self.p)
+            points[:, :n_x] += (within - of_p) @ belief.slopes[:, : len(self.p)].T
+            of_p[:] = within
             values = self.simulated(w, state, points)
             if np.isfinite(values).all():
                 linear = LinearInterval.of(belief, n_q, points, values)
                 left = linear.sampled(np.square(linear.of_unknown[:, n_x:]).sum(axis=1), len(self.of.columns))
-                known = self.of.intervals.known[self.rows(w)][:, self.of.columns]
-                if (left / np.square(self.noise.sigma) * known).sum() <= CURVED * known.sum():
+                if (left / np.square(self.noise.sigma) * self.known[w]).sum() <= CURVED * self.known[w].sum():
                     return linear
         steps = np.append(STEPS["state"] * np.maximum(1.0, np.abs(state)), self.steps)
         points = np.vstack([np.zeros(len(steps)), np.diag(steps)])
         values = self.simulated(w, state, points)
         return LinearInterval.of(belief, n_q, points, values) if np.isfinite(values).all() else None
 
-    def rows(self, w: int) -> slice:
-        """Rows of an interval."""
-        start, length = int(self.of.intervals.starts[w]), self.of.intervals.length
-        return slice(start, start + length)
-
     def interval(self, w: int, state: FloatArray, belief: Belief) -> tuple[FloatArray, Belief | None]:
         """State and belief at the end of an interval, after its samples; None: the motion is lost."""
         check_time()
-        columns, rows, done = self.of.columns, self.rows(w), self.done
-        known = self.of.intervals.known[rows][:, columns]
+        columns, known, done = self.of.columns, self.known[w], self.done
         linear = self.linear(w, state, belief)
         if linear is None:
             done.states[w], done.losses[w], done.lost[w] = state, 10.0 * float(known.sum()), True
@@ -483,7 +468,8 @@ class _Run:
         update = self.updated(w, state, belief, linear, inlying / np.square(self.noise.sigma))
         self.count(w, update, belief, float(inlying.sum()))
         done.states[w] = state + update.moved
-        done.residuals[rows, columns] = np.where(known, linear.sampled(update.values, len(columns)), 0.0)
+        of_interval = done.residuals.reshape(*self.known.shape[:2], -1)[w]
+        of_interval[:, columns] = np.where(known, linear.sampled(update.values, len(columns)), 0.0)
         end = update.values[-len(state) :]
         is_lost = self.contradicts and before and bool(self.of.intervals.following[w])
         return end, None if is_lost else self.lacking(w, update, linear)
