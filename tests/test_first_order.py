@@ -22,7 +22,7 @@ from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.regression import observers as search
 from diransac.identification.regression.multistart import least_squares
-from diransac.identification.regression.observers import observers
+from diransac.identification.regression.observers import ObserverFit
 from diransac.identification.structure.structural import structural
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
@@ -357,8 +357,8 @@ def observers_of_joint(bandwidth):
     model, states = flexible_joint(), np.column_stack([joint_signals()[1][n] for n in flexible_joint().state])
     layout = ParameterLayout(model.parameters)
     sampled, weights = signals["motor"][:, None], np.full((len(t), 1), 1e4 / len(t))
-    given = (inputs["torque"][:, None], np.zeros((len(t), 0)), weights, states[:1], [slice(0, len(t))], t[1])
-    problem = observers(model, layout, ("motor",), sampled, *given, bandwidth)
+    given = (states[:1], inputs["torque"][:, None], np.zeros((len(t), 0)), weights, [slice(0, len(t))], t[1])
+    problem = ObserverFit(model, layout, model.state, (), ("motor",), sampled, *given, bandwidth)
     z = np.concatenate([[1.1 * x for x in JOINT.values()], states[0]])[None]
     return problem, z, signals
 
@@ -403,9 +403,9 @@ def test_observers_find_a_joint_from_anywhere():
 def test_observers_of_long_logs_start_from_their_liveliest_stretch(monkeypatch):
     """Parameters come from there, and states are those of the beginning of the log."""
     problem, _, _ = observers_of_joint(10.0)
-    n = len(problem.samples)
-    monkeypatch.setattr(search, "_ENOUGH", n // 2)
-    found = problem.best_starts([(60, 5)])
+    monkeypatch.setattr(search, "STRETCH", len(problem.samples) // 2)
+    fit, found = problem.search([(10.0, 60, 5)])
+    assert fit.rows_of_logs == problem.rows_of_logs
     assert found[0, :5] == pytest.approx(list(JOINT.values()), rel=0.05)
     np.testing.assert_array_equal(found[:, 5:], np.tile(problem.begin, (5, 1)))
 
@@ -413,24 +413,26 @@ def test_observers_of_long_logs_start_from_their_liveliest_stretch(monkeypatch):
 def test_the_liveliest_stretch_is_where_inputs_change_and_samples_count(monkeypatch):
     problem, _, _ = observers_of_joint(10.0)
     n, rows = len(problem.samples), np.arange(len(problem.samples))
-    monkeypatch.setattr(search, "_ENOUGH_OF_ONE", n // 8)
+    monkeypatch.setattr(search, "STRETCH", n // 2)
     still = np.where(np.abs(rows - 0.35 * n) < 0.1 * n, problem.inputs[:, 0], problem.inputs[0, 0])
     still[9 * n // 10 :] += 1e3
     known = np.where(np.abs(rows - 0.9 * n)[:, None] < 3.0, 0.0, problem.weights)
     logs = [slice(0, n // 2), slice(n // 2, n)]
     begin = np.tile(problem.begin, (2, 1))
     two = replace(problem, inputs=still[:, None], weights=known, rows_of_logs=logs, begin=begin)
-    stretches = two._on_stretches(0.5)
+    stretches = two.on_stretches()
     first, second = stretches.rows_of_logs
     assert first.stop - first.start == second.stop - second.start == n // 4
     assert first.start <= 0.25 * n + 1
     assert first.stop >= 0.45 * n - 1
     assert second.start == n // 2  # the step is where nothing was sampled
     assert stretches.begin[0, 0] == problem.samples[first.start, 0]
-    slow = replace(two, weights=np.where(rows[:, None] % 10 == 0, known, 0.0))._on_stretches(0.5).rows_of_logs
+    slow = replace(two, weights=np.where(rows[:, None] % 10 == 0, known, 0.0)).on_stretches().rows_of_logs
     assert slow[0] == first  # samples that are slower than inputs
-    short = two._on_stretches(0.01).rows_of_logs[1]
-    assert short.stop - short.start == n // 8  # enough of each log
+    monkeypatch.setattr(search, "STRETCH", n // 4)
+    five = [slice(k * n // 5, (k + 1) * n // 5) for k in range(5)]
+    short = replace(two, rows_of_logs=five, begin=np.tile(problem.begin, (5, 1))).on_stretches().rows_of_logs[1]
+    assert short.stop - short.start == n // 4 // 4  # enough of each log
 
 
 def test_larger_problems_have_fewer_starts():

@@ -17,7 +17,7 @@ from command_line import run
 from diransac.errors import ModelError, ResultError, TimeLimitError
 from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.methods.lo_diransac import prediction_error, without_equations
-from diransac.identification.methods.lo_diransac.following import Predictor
+from diransac.identification.methods.lo_diransac.interval_filter import IntervalFilter
 from diransac.identification.methods.lo_diransac.prediction_error import Minimum, minimised
 from diransac.model.mjcf import MujocoModel, calibrated_text
 from diransac.model.mjcf.model import write
@@ -297,7 +297,7 @@ def test_contacts_that_chatter_are_told_by_slopes_over_the_spread(
     ((local, spread),) = ends
     assert spread.last.losses.sum() < local.last.losses.sum() - 100.0
     assert (np.diag(spread.covariance) >= np.diag(local.covariance)).all()
-    at_end = spread.predictor.over_logs(spread.parameters).losses.sum()
+    at_end = spread.kalman.over_logs(spread.parameters).losses.sum()
     assert at_end == pytest.approx(spread.last.losses.sum(), rel=1e-9)
     for name, (low, high) in result.intervals(0.95).items():
         assert low <= truth[name] <= high
@@ -323,14 +323,15 @@ def test_slopes_over_the_spread_are_local_ones_of_a_linear_machine(
     result = dr.identify(dr.models.mujoco(tmp_path / "carts.xml", unknown=names), log)
     at = np.array([1.0, damping])
     wide = prediction_error.with_widths(ends[0].covariance, np.full(3, 0.01))
-    over = replace(ends[0].predictor, spread=wide).over_logs(at)
-    local = ends[0].predictor.over_logs(at)
-    np.testing.assert_allclose(over.information[:2, :2], local.information[:2, :2], rtol=0.02)
+    over = replace(ends[0].kalman, spread=wide).over_logs(at)
+    local = ends[0].kalman.over_logs(at)
+    total, of_local = (x.information.sum(axis=0)[:2, :2] for x in (over, local))
+    np.testing.assert_allclose(total, of_local, rtol=0.02)
     assert over.losses.sum() == pytest.approx(local.losses.sum(), abs=1.0)
     assert result.parameters["body/cart0.mass"] == pytest.approx(1.0, rel=1e-3)
-    noise = replace(ends[0].predictor.noise, pi=np.zeros_like(ends[0].predictor.noise.pi))
+    noise = replace(ends[0].kalman.noise, pi=np.zeros_like(ends[0].kalman.noise.pi))
     told = [
-        replace(ends[0].predictor, noise=replace(noise, sigma=noise.sigma / k)).over_logs(at).information[0, 0]
+        replace(ends[0].kalman, noise=replace(noise, sigma=noise.sigma / k)).over_logs(at).information[:, 0, 0].sum()
         for k in (1.0, 3.0)
     ]
     assert 0.2 * told[0] < told[1] < 5.0 * told[0]  # not nine times as much: all samples are wrong
@@ -394,14 +395,14 @@ def test_a_fit_that_does_not_follow_the_motion_begins_elsewhere(
 ) -> None:
     starts = list[Any]()
 
-    def fitted(predictor: Predictor, start: Any, **options: Any) -> Minimum:
+    def fitted(kalman: IntervalFilter, start: Any, **options: Any) -> Minimum:
         starts.append(start)
-        found = minimised(predictor, start, **options)
+        found = minimised(kalman, start, **options)
         if len(starts) > failing:
             return found
-        noise = replace(found.predictor.noise, pi=np.full(len(found.predictor.noise.pi), outliers))
+        noise = replace(found.kalman.noise, pi=np.full(len(found.kalman.noise.pi), outliers))
         last = replace(found.last, losses=found.last.losses + 1.0)
-        return replace(found, predictor=replace(found.predictor, lacks=lacks, noise=noise), last=last)
+        return replace(found, kalman=replace(found.kalman, lack=lacks, noise=noise), last=last)
 
     monkeypatch.setattr(without_equations, "minimised", fitted)
     u = (20.0 * np.sin(6.0 * TIME) + 15.0 * np.sin(23.0 * TIME))[:400]
@@ -428,12 +429,12 @@ def test_a_time_limit_during_a_further_start_is_said_and_the_best_so_far_is_kept
 ) -> None:
     starts = list[Any]()
 
-    def fitted(predictor: Predictor, start: Any, **options: Any) -> Minimum:
+    def fitted(kalman: IntervalFilter, start: Any, **options: Any) -> Minimum:
         starts.append(start)
-        found = minimised(predictor, start, **options)
+        found = minimised(kalman, start, **options)
         if len(starts) == 1:
             last = replace(found.last, losses=found.last.losses + 1.0)
-            return replace(found, predictor=replace(found.predictor, lacks=0.5), parameters=start, last=last)
+            return replace(found, kalman=replace(found.kalman, lack=0.5), parameters=start, last=last)
         raise TimeLimitError
 
     monkeypatch.setattr(without_equations, "minimised", fitted)

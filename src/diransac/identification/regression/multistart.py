@@ -15,8 +15,8 @@ from diransac.arrays import FloatArray, IntArray
 from diransac.identification.regression.estimators import solve_definite
 from diransac.time_limit import check_time
 
-# Bounds of Marquardt's damping: the last is a step of nothing.
-_BOUNDS = (1e-9, 1e9)
+LARGEST_DAMPING = 1e9
+"""Marquardt's damping, over the scaled normal matrix, with which a step moves nothing; the least is its inverse."""
 
 
 class LeastSquaresProblem(Protocol):
@@ -73,9 +73,9 @@ def least_squares(
         trial = problem.moved(z[active], -np.nan_to_num(back[promising]))
         then = problem.linearized(trial, active)
         better = then[0] < cost[active]
-        settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= _BOUNDS[1])
+        settled = better & (then[0] > (1.0 - tolerance) * cost[active]) | (damping[active] >= LARGEST_DAMPING)
         to = active[better]
         z[to], cost[to], gradient[to], matrix[to] = (x[better] for x in (trial, *then))
-        damping[active] = np.clip(np.where(better, 0.2, 6.0) * damping[active], *_BOUNDS)
+        damping[active] = np.clip(np.where(better, 0.2, 6.0) * damping[active], 1.0 / LARGEST_DAMPING, LARGEST_DAMPING)
         active = active[~settled]
     return z, cost

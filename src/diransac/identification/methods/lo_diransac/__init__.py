@@ -27,7 +27,7 @@ In comes a `Dataset`; out comes an `Estimate` with its `Diagnosis`.  Begin with 
 | `judge.py`, `forward.py` | their predictions of held-out blocks: of motion, and of forces |
 | `simulation_error.py`, `segments.py` | one of them: simulation error of segments |
 | **models without equations** | |
-| `without_equations.py`, `prediction_error.py`, `following.py`, `linear_intervals.py` | by a simulator alone |
+| `without_equations.py`, `prediction_error.py`, `interval_filter.py` | by a simulator alone |
 """
 
 from diransac.identification.methods.lo_diransac.method import LoDiransac, configured

@@ -7,32 +7,30 @@ hypotheses. Its trajectories take the place of smoothed signals until shooting e
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, robust_std
+from diransac.arrays import BoolArray, FloatArray
+from diransac.identification.core.noise import lower_scale
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores
 from diransac.identification.methods.lo_diransac.smoothing import Motion
+from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from diransac.identification.core.windows import ShootingIntervals
     from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 
-# Steps from all starts, and from the best ones, with the number that goes on; further steps.
-_N_FINALISTS, _N_FURTHER_STEPS = 12, 15
-_STEPS = ((15, _N_FINALISTS), (60, _N_FINALISTS))
-# Memory of the observers, in shooting intervals, over which errors of the smoothed motion average out.
-_MEMORY = 4.0
-# Bandwidths of observers that follow samples, over that of an interval; steps with each, and the number that goes on.
-_STAGES = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, _N_FINALISTS))
-# Samples further than so many standard deviations from the smoothed motion are outliers.
-_OUTLYING = 5.0
-_TINY = 1e-9
+DRIVEN = ((0.25, 15, 12), (0.25, 60, 12))
+"""Stages of simulations that the smoothed motion drives: bandwidth over that of an interval, in which errors of the
+smoothed motion average out, steps, and the number of starts that go on."""
+OBSERVED = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, 12))
+"""Stages of observers that follow the samples, which become simulations."""
 
 
 def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
@@ -134,11 +132,7 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     Motion or None
         None if every simulation diverges.
     """
-    from diransac.identification.regression.multistart import least_squares
-
-    problem = _driven(intervals, motion)
-    z, cost = least_squares(problem, problem.best_starts(_STEPS), _N_FURTHER_STEPS)
-    return _best(intervals, motion, problem, z[np.isfinite(cost)])
+    return _best(intervals, motion, _driven(intervals, motion), DRIVEN)
 
 
 def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
@@ -155,17 +149,7 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     Motion or None
         None if every observer diverges.
     """
-    from diransac.identification.regression.multistart import least_squares
-
-    (width, n_steps, n_kept), *stages = _STAGES
-    problem = replace(_observers(intervals, motion), bandwidth=width / intervals.duration)
-    z = problem.best_starts([(n_steps, n_kept)])
-    for width, n_steps, n_kept in stages:
-        problem = replace(problem, bandwidth=width / intervals.duration)
-        z, cost = least_squares(problem, z, n_steps)
-        best = np.argsort(cost, kind="stable")[:n_kept]
-        z, cost = z[best], cost[best]
-    return _best(intervals, motion, problem, z[np.isfinite(cost)])
+    return _best(intervals, motion, _observers(intervals, motion), OBSERVED)
 
 
 def _driven(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
@@ -173,7 +157,7 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     from diransac.identification.regression.observers import driven_states
 
     model, hidden = intervals.model, unmeasured_states(intervals)
-    bandwidth = 1.0 / (_MEMORY * intervals.duration)
+    bandwidth = DRIVEN[0][0] / intervals.duration
     others = [i for i, n in enumerate(model.velocities) if n not in hidden]
     first = len(model.signals) - len(model.sensors)
     readings = motion.signals[:, first:]
@@ -200,7 +184,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
     kinematics give.
     """
-    from diransac.identification.regression.observers import observers
+    from diransac.identification.regression.observers import ObserverFit
 
     model, hidden, measured = intervals.model, unmeasured_states(intervals), measured_signals(intervals)
     corrected = {chain[1] for chain in model.chains if chain[0] in measured and len(chain) > 1}
@@ -208,33 +192,26 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     columns = [model.signals.index(n) for n in (*sampled, *model.sensors)]
     smoothed, known = motion.signals[:, columns], intervals.known[:, columns]
     apart = np.where(known, np.abs(intervals.measured[:, columns] - smoothed), 0.0)
-    noise = np.array([robust_std(x[i]) if i.any() else 0.0 for x, i in zip(apart.T, known.T, strict=True)])
-    inlying = known & (apart < _OUTLYING * noise + _TINY)
+    noise = np.nan_to_num(lower_scale(apart, known))
+    inlying = known & (apart < CLEAR * noise + 1e-9)
     values = np.where(inlying, intervals.measured[:, columns], np.nan_to_num(smoothed))
-    weights = np.where(inlying, 1.0 / np.square(noise + _TINY), 0.0) / max(inlying.sum(), 1)
+    weights = np.where(inlying, 1.0 / np.square(noise + 1e-9), 0.0) / max(inlying.sum(), 1)
     first = np.array([rows.start for rows in intervals.rows_of_logs])
     scalars = [model.state[four[0]] for four in model.quaternions]
     begin = motion.signals[first][:, [model.signals.index(n) for n in model.state]]
     begin = np.where([n in hidden for n in model.state], [float(n in scalars) for n in model.state], begin)
-    return observers(
-        model,
-        intervals.layout,
-        sampled,
-        values[:, : len(sampled)],
-        intervals.inputs,
-        values[:, len(sampled) :],
-        weights,
-        begin,
-        intervals.rows_of_logs,
-        intervals.dt,
-        bandwidth=1.0 / intervals.duration,
-        substeps=intervals.substeps,
-    )
+    recorded = intervals.inputs, values[:, len(sampled) :], weights, intervals.rows_of_logs
+    timing = intervals.dt, 1.0 / intervals.duration, intervals.substeps
+    every = model, intervals.layout, model.state, (), sampled
+    return ObserverFit(*every, values[:, : len(sampled)], begin, *recorded, *timing)
 
 
-def _best(intervals: ShootingIntervals, motion: Motion, problem: ObserverFit, z: FloatArray) -> Motion | None:
-    """The motion whose parameters simulate the intervals best, of vectors of unknowns ``(k, n)``."""
-    completed, every = [_completed(motion, problem, one) for one in z], np.arange(len(intervals))
+def _best(
+    intervals: ShootingIntervals, motion: Motion, problem: ObserverFit, stages: Sequence[tuple[float, int, int]]
+) -> Motion | None:
+    """The motion whose parameters simulate the intervals best, of those to which stages lead."""
+    fit, z = problem.search([(width / intervals.duration, n_steps, n_kept) for width, n_steps, n_kept in stages])
+    completed, every = [_completed(motion, fit, one) for one in z], np.arange(len(intervals))
     pairs = zip(completed, z[:, : len(intervals.layout)], strict=True)
     scores = [robust_scores(intervals, one, p[None], every)[0] for one, p in pairs]
     return completed[int(np.argmin(scores))] if np.isfinite(scores).any() else None
@@ -245,5 +222,5 @@ def _completed(motion: Motion, problem: ObserverFit, z: FloatArray) -> Motion:
     signals, spread = motion.signals.copy(), motion.spread.copy()
     for name, values in problem.trajectories(z).items():
         column = problem.model.signals.index(name)
-        signals[:, column], spread[column] = values, values.std() + _TINY
+        signals[:, column], spread[column] = values, values.std() + 1e-9
     return Motion(signals, spread)
