@@ -392,11 +392,10 @@ def test_jackknife_is_that_of_a_mean() -> None:
     assert jackknife(without)[0, 0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_least_squares_competes_at_several_bandwidths(bound: tuple) -> None:
+def test_least_squares_competes_where_the_bounds_admit_it(bound: tuple) -> None:
+    """At nine samples a period smoothing sees no inertia: ordinary least squares leaves the bounds."""
     dataset, intervals, _, blocks = bound
-    names = [x.name for x in least_squares_candidates(dataset, intervals, blocks)]
-    assert sum(name.startswith("ols") for name in names) >= 1
-    assert len(set(names)) == len(names)
+    assert [x.name for x in least_squares_candidates(dataset, intervals, blocks)] == ["nls"]
 
 
 # ---------------------------------------------------------------------- results
@@ -412,7 +411,7 @@ def test_the_result_predicts_as_well_as_every_competitor(lacking: dr.Result) -> 
     assert found is not None
     winner = next(x for x in found.competitors if x.name == found.winner)
     assert winner.score <= 1.03 * min(x.score for x in found.competitors)
-    assert {x.name.partition(",")[0] for x in found.competitors} >= {"ols", "nls", "simulation error", "joint fit"}
+    assert {x.name.partition(",")[0] for x in found.competitors} >= {"nls", "simulation error", "joint fit"}
 
 
 def test_an_answer_where_smoothing_sees_nothing(lacking: dr.Result) -> None:

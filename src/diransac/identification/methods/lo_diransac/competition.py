@@ -1,7 +1,7 @@
 """Competition of estimates: sources propose them, and the judge compares their predictions.
 
 Where the exact model of a fit predicts a log within its noise, there is no competition.  Elsewhere the estimates of the
-joint fit compete with least squares of all rows and with simulation error.  Where one of these beats or contradicts the
+joint fit compete with least squares of all rows and with simulation error.  Where one of these contradicts the
 fit, which may be at a local optimum, another one begins with its parameters and its motion, and the likelier counts.
 """
 

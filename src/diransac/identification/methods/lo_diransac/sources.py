@@ -1,4 +1,4 @@
-"""Candidates of the competition, and least squares of all rows: of signals as recorded, and at several bandwidths."""
+"""Candidates of the competition, and least squares of all rows."""
 
 from __future__ import annotations
 
