@@ -600,6 +600,9 @@ def test_an_accelerometer_alone_shows_two_lags():
     found = dr.identify(weighed_thrust(), weighed_log(0, 0.1, 0.1), differentiate=True)
     lags = sorted(found.parameters[n] for n in ("tau", "sensor_tau"))  # they may be exchanged
     assert [*(found.parameters[n] for n in ("linear", "square")), *lags] == pytest.approx([*WEIGHED.values()], rel=0.15)
+    (said,) = [x for x in found.findings if x.level == "bad"]
+    assert "explain this log as well" in said
+    assert "sensor_tau = " in said
     others = [x for x in found.findings if x.level == "care"]
     assert all("If the model lacks a term" in x for x in others)  # commands vary by a tenth of their mean
 

@@ -34,7 +34,9 @@ from diransac.identification.methods.lo_diransac.parts import compared_parts
 from diransac.identification.methods.lo_diransac.preparation import prepared
 from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 from diransac.identification.methods.lo_diransac.search import Searched, rows_of_logs
+from diransac.identification.methods.lo_diransac.segments import ActingInputs
 from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
+from diransac.identification.methods.lo_diransac.simulation_error import explains_as_well
 from diransac.identification.methods.lo_diransac.unmeasured import (
     measured_signals,
     unmeasured_by_name,
@@ -42,9 +44,10 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
 )
 from diransac.identification.regression.rows import excited
 from diransac.identification.structure.columns import FITTED_MOTION
+from diransac.identification.structure.equivalents import equivalent_parameters, is_close
 from diransac.identification.structure.free_units import KnownUpTo, known_up_to_units
 from diransac.identification.structure.refusal import check_signs
-from diransac.identification.structure.structural import check_structure, unidentifiable
+from diransac.identification.structure.structural import check_structure, structural, unidentifiable
 from diransac.process import memory_kept
 
 if TYPE_CHECKING:
@@ -231,7 +234,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     checks = (
         *_checks(settings, best),
         *_checks_of_bounds(best),
-        *_checks_of_unmeasured(best),
+        *_checks_of_unmeasured(settings, dataset, best),
         *findings_of_fit(likeliest, best.decided.acting if best.decided else None),
         *parts.findings,
     )
@@ -277,9 +280,10 @@ def _checks_of_bounds(found: Searched) -> Iterator[Finding]:
         )
 
 
-def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
-    """Findings where nothing measures a state, so that a search is doubtful."""
-    names = unmeasured_by_name(found.likeliest.intervals)
+def _checks_of_unmeasured(settings: LoDiransacSettings, dataset: Dataset, found: Searched) -> Iterator[Finding]:
+    """Findings where nothing measures a state, so that a search is doubtful, or other parameters are as good."""
+    intervals, p = found.likeliest.intervals, found.result.parameters
+    names = unmeasured_by_name(intervals)
     if found.is_doubtful:
         share = 100.0 * found.unexplained
         yield Finding(
@@ -288,6 +292,32 @@ def _checks_of_unmeasured(found: Searched) -> Iterator[Finding]:
             "does not tell them apart",
             f"measure {names}",
         )
+    timing = found.timing(forced=settings.forces_timing)
+    acting = ActingInputs(intervals.inputs, intervals.hold, timing)
+    exact = found.likeliest.exact
+    for other in _equivalents(dataset, intervals, p):
+        if explains_as_well(intervals, found.motion, acting, p, other, exact=exact, outliers=settings.outliers):
+            pairs = zip(dataset.layout.names, other.tolist(), is_close(other, p), strict=True)
+            changed = {name: x for name, x, close in pairs if not close}
+            values = ", ".join(f"{name} = {x:.4g}" for name, x in changed.items())
+            yield Finding(
+                "bad",
+                f"Since nothing measures {names}, {values} {'explain' if exact else 'may explain'} this log as well",
+                f"bound {' or '.join(changed)}, or measure {names}",
+            )
+            return
+
+
+def _equivalents(dataset: Dataset, intervals: ShootingIntervals, parameters: FloatArray) -> list[FloatArray]:
+    """Other admissible parameters that have the transfer function of given ones.
+
+    Where all states are measured, equations of motion determine the parameters, and there are none.
+    """
+    model, layout, signals = dataset.model, dataset.layout, measured_signals(intervals)
+    if not unmeasured_states(intervals) or not layout.is_shared or structural(model, signals, dataset.ranges):
+        return []
+    found = equivalent_parameters(model, parameters, signals, dataset.ranges)
+    return [p for p in found if layout.admits(p[None])[0]]
 
 
 # ---------------------------------------------------------------------- the estimate

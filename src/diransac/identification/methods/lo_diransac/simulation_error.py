@@ -37,6 +37,7 @@ from diransac.identification.methods.lo_diransac.segments import (
     whole_stretches,
 )
 from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate, jackknife
+from diransac.identification.structure.equivalents import is_close
 
 if TYPE_CHECKING:
     from diransac.arrays import IntArray
@@ -59,6 +60,8 @@ _STEPS = 25
 """Largest number of steps."""
 _FEW_STEPS = 3
 """Steps of a solution that is close to another."""
+_AS_LIKELY = 5.0
+"""Difference of log-likelihoods, nats, below which two estimates are as likely."""
 _SIMULATED = 0.5
 """Robust scale of the errors over the spread of a signal, up to which a simulation follows it."""
 _RIDGE = 1e-10
@@ -116,6 +119,42 @@ def simulation_error_candidates(
     hopeless = last.cost + HOPELESS * np.count_nonzero(last.windows.known)
     found = [*(x for x in others if x.cost < hopeless), *chain[1:]]
     return [(x.candidate(blocks), x.simulated) for x in reversed(found)]
+
+
+def explains_as_well(
+    intervals: ShootingIntervals,
+    motion: Motion,
+    acting: ActingInputs,
+    parameters: FloatArray,
+    other: FloatArray,
+    *,
+    exact: bool,
+    outliers: bool = True,
+) -> bool:
+    """True if other parameters simulate whole logs as well, and stay apart from given ones in a fit.
+
+    Where the model is not exact, what it lacks does not tell estimates apart whose errors differ by a tenth.
+
+    Parameters
+    ----------
+    intervals : ShootingIntervals
+    motion : Motion
+        From which states start that nothing measures.
+    acting : ActingInputs
+    parameters, other : (n,) array
+    exact : bool
+        Whether the model is.
+    outliers : bool, optional
+        Whether samples may be outliers.
+    """
+    length = min((x.stop - x.start for x in whole_stretches(intervals)), default=0)
+    segments = _segments(intervals, acting, min(length, _MOST_ROWS), _MOST_ROWS)
+    if not len(segments):
+        return False
+    noise = _first_noise(segments, motion.spread, outliers=outliers)
+    own, found = (_Solution.begin(segments, motion, p, noise).descended() for p in (parameters, other))
+    worse = _AS_LIKELY if exact else HOPELESS * np.count_nonzero(own.windows.known)
+    return found.loss < own.loss + worse and not is_close(found.parameters, own.parameters).all()
 
 
 def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
