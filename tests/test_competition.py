@@ -392,8 +392,8 @@ def test_jackknife_is_that_of_a_mean() -> None:
     assert jackknife(without)[0, 0] == pytest.approx(expected, rel=1e-3)
 
 
-def test_least_squares_competes_where_the_bounds_admit_it(bound: tuple) -> None:
-    """At nine samples a period smoothing sees no inertia: ordinary least squares leaves the bounds."""
+def test_least_squares_competes_within_the_bounds(bound: tuple) -> None:
+    """At nine samples a period smoothing sees no inertia: least squares of all rows stays on its bound."""
     dataset, intervals, _, blocks = bound
     assert [x.name for x in least_squares_candidates(dataset, intervals, blocks)] == ["nls"]
 

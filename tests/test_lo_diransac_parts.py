@@ -54,7 +54,7 @@ def intervals_of(n_rows=200, length=25, dt=0.01):
 
 def smoothed(measured, known):
     """The motion of a log at 100 Hz, from 25 rows to either side."""
-    samples = Samples.of(measured, known, np.zeros(len(measured), bool), 25)
+    samples = Samples.of(measured, known, np.zeros(len(measured), bool), 0.01)
     return smooth(ROTORCRAFT, [samples], 0.01, np.full(9, 25))[0]
 
 
@@ -193,7 +193,7 @@ def samples_of(known: np.ndarray, wave, noise: float = 0.02) -> Samples:
     t = 0.01 * np.arange(len(known))
     measured = wave(t)[:, None] + noise * np.random.default_rng(6).normal(size=known.shape)
     measured = np.where(known, measured, 0.0)
-    return Samples.of(measured, known, ~known.any(axis=1), 25)
+    return Samples.of(measured, known, ~known.any(axis=1), 0.01)
 
 
 def test_half_width_is_wider_where_the_motion_is_slower_and_narrower_where_it_is_faster():

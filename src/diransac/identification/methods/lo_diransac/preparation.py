@@ -33,7 +33,7 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
     LogError
         The logs are too short.
     """
-    samples, notes = screened(settings, dataset)
+    samples, notes = screened(dataset)
     halves, length = choose_half_widths(dataset.model, samples, dataset.dt, settings.smoothing_half_width)
     n_rows, longest = sum(map(len, dataset.segments)), max(map(len, dataset.segments))
     if n_rows < FEWEST_INTERVALS * length or longest < length:
@@ -62,25 +62,25 @@ def cut(settings: LoDiransacSettings, dataset: Dataset, samples: Sequence[Sample
     return replace(intervals, threads=settings.criteria.threads or default_threads())
 
 
-def screened(settings: LoDiransacSettings, dataset: Dataset) -> tuple[list[Samples], tuple[str, ...]]:
+def screened(dataset: Dataset) -> tuple[list[Samples], tuple[str, ...]]:
     """Samples of each log without rows that are stuck, and a note on each log that has some."""
     samples, notes = [], []
     for log in dataset.segments:
         stuck = stuck_rows(log.measured[:, [log.signals.index(name) for name in log.present]])
-        samples.append(_samples(log, stuck, dataset.dt, settings.smoothing_half_width))
+        samples.append(_samples(log, stuck, dataset.dt))
         if stuck.any():
             source = f"{log.log.source}: " if len(dataset.segments) > 1 else ""
             notes.append(f"{source}{stuck.sum()} rows repeat the row before in every signal, and were taken as missing")
     return samples, tuple(notes)
 
 
-def _samples(log: Segment, stuck: BoolArray, dt: float, half_width: float) -> Samples:
+def _samples(log: Segment, stuck: BoolArray, dt: float) -> Samples:
     """Samples of a log in the model's order of signals."""
     order = list(log.model.signals)
     measured = np.full((len(log), len(order)), np.nan)
     measured[:, [order.index(name) for name in log.signals]] = log.measured
     known = np.isfinite(measured) & ~stuck[:, None]
-    return Samples.of(np.where(known, measured, 0.0), known, log.gaps | silent_rows(known, dt), half_width / dt)
+    return Samples.of(np.where(known, measured, 0.0), known, log.gaps | silent_rows(known, dt), dt)
 
 
 def stuck_rows(measured: FloatArray) -> BoolArray:

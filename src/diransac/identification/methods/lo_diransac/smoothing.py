@@ -1,29 +1,30 @@
-"""The motion without a model: local polynomials that a coordinate shares with its velocity and acceleration.
+"""The motion without a model.
 
-In a window about each knot a polynomial of degree 4 is fitted to the measured ones of a coordinate and its derivatives.
-Weights are Geman and McClure's, the scale of each signal a low quantile of its residuals, so that more than half of the
-samples may be outliers; residuals start from a running median, and scales decrease gradually, to avoid local optima
-(graduated non-convexity).  Between two knots their polynomials are blended.
-
-Arrays are ``(C, c, K, n_t)``: C chains, each of c signals of which one is the derivative of the one before, K windows
-of ``n_t`` rows.
+The motion is local polynomials that a coordinate shares with its velocity and acceleration.  In a window about each
+knot a polynomial of degree 4 is fitted to the measured ones of a coordinate and its derivatives.  Weights are Geman
+and McClure's, the scale of each signal a low quantile of its residuals, so that more than half of the samples may be
+outliers; residuals start from a running median, and scales decrease gradually, to avoid local optima (graduated
+non-convexity).
 
 References
 ----------
-Geman, McClure 1987; Black, Rangarajan 1996; Yang, Antonante, Tzoumas, Carlone 2020 (graduated non-convexity);
-Cleveland 1979 (robust local regression).
+Hampel 1974; Geman, McClure 1987; Black, Rangarajan 1996; Yang, Antonante, Tzoumas, Carlone 2020 (graduated
+non-convexity); Cleveland 1979 (robust local regression).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, interpolated, robust_std, size_or_one
+from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std, row_blocks
 from diransac.data.checks import rows_per_sample
 from diransac.data.filters import median_filter
 from diransac.identification.core.noise import lower_scale
@@ -32,24 +33,27 @@ from diransac.simulation.compiler import compile_map
 if TYPE_CHECKING:
     from diransac.model import Model
 
-# Of the polynomials.
-_DEGREE = 4
-# Samples of a signal to either side of a knot, usually at most.
-_MOST = 25
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+_DEGREE, _STEPS = 4, 12
+_SHRINK = 0.3
+_FLOOR, _VISIBLE = 1e-4, 1e-2
+_AT_REST = 0.1
+_TRIALS = 24
+_MEDIAN = 0.31
+"""Window of the running median from which smoothing starts, s."""
+_MOST_MEDIAN = 31
+"""Samples of that window at most."""
 # Factor between half widths that are compared, and by which a window widens that has too few samples.
 _WIDER = 3
-# Reweightings.
-_PASSES = 12
-# Least factor of a scale from one reweighting to the next.
-_SHRINK = 0.3
-# Least scale of residuals over the spread of a signal: polynomials are not exact.
-_FLOOR = 1e-4
-# Least error of a coordinate over its spread that narrow windows, whose derivatives are noisier, are worth.
-_VISIBLE = 0.01
-# Windows in which half widths are compared, of the usual one.
-_TRIALS = 24
+# Weight of a polynomial that was fitted to fewer samples than it has coefficients.
+_UNINFORMED = 1e-9
+# Samples that a window has at least, and those to either side of a knot that always suffice.
+_FEWEST, _ENOUGH_SAMPLES = 5, 25
 # Residuals that a scale is taken from; more would only cost time.
 _ENOUGH = 4000
+# Numbers of the windows that are fitted together at most; more would only take memory.
+_NUMBERS_TOGETHER = 100_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,27 +66,27 @@ class Samples:
         Each signal in its unit; 0 where missing.
     known : (N, n_signals) bool array
         Samples that are measured.
+    centre : (N, n_signals) array
+        Running median.
     gaps : (N,) bool array
         Rows of gaps in inputs, or in all sensors.
-    centre : (N, n_signals) array
-        Running median; missing samples are interpolated between medians, and 0 in signals without any.
     """
 
     measured: FloatArray
     known: BoolArray
-    gaps: BoolArray
     centre: FloatArray
+    gaps: BoolArray
 
     @classmethod
-    def of(cls, measured: FloatArray, known: BoolArray, gaps: BoolArray, half_width: float) -> Samples:
-        """Samples with medians over 1.2 half widths, rows; of at least 5 and at most 31 samples of a signal."""
-        rows, centre = np.arange(len(measured)), np.zeros(measured.shape)
-        for median, values, mask in zip(centre.T, measured.T, known.T, strict=True):
-            if mask.any():
-                half = min(half_width / rows_per_sample(mask), _MOST)
-                size = max(_DEGREE + 1, 2 * round(0.6 * half) + 1)
-                median[:] = np.interp(rows, rows[mask], median_filter(values[mask], size))
-        return cls(measured, known, gaps, centre)
+    def of(cls, measured: FloatArray, known: BoolArray, gaps: BoolArray, dt: float) -> Samples:
+        """Samples with running medians, between which missing samples are interpolated; 0 in signals without any."""
+        rows, medians = np.arange(len(measured)), np.zeros(measured.shape)
+        window = max(_FEWEST, min(_MOST_MEDIAN, 2 * round(0.5 * (_MEDIAN / dt - 1.0)) + 1))
+        for i in np.flatnonzero(known.any(axis=0)):
+            size = max(_FEWEST, 2 * (window // rows_per_sample(known[:, i]) // 2) + 1)
+            values = median_filter(measured[known[:, i], i], min(size, window))
+            medians[:, i] = np.interp(rows, rows[known[:, i]], values)
+        return cls(measured, known, medians, gaps)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,6 +118,28 @@ def split_signals(model: Model, signals: FloatArray) -> list[FloatArray]:
 # ---------------------------------------------------------------------- the motion
 
 
+def _chains(model: Model) -> list[list[int]]:
+    """Columns among the model's signals of each quantity and of its derivatives, without sensors."""
+    return [[model.signals.index(name) for name in chain] for chain in model.chains]
+
+
+def _alike(chains: Sequence[Sequence[int]], halves: IntArray, size: int) -> list[tuple[IntArray, int]]:
+    """Columns ``(C, c)`` of chains of one length and half width, which are fitted together, and the half width.
+
+    Fewer are fitted together, the larger each is.
+    """
+    together, found = max(1, _NUMBERS_TOGETHER // size), []
+    for c, half in sorted({(len(x), int(halves[x[0]])) for x in chains}):
+        columns = np.array([x for x in chains if (len(x), halves[x[0]]) == (c, half)])
+        found += [(columns[k : k + together], half) for k in range(0, len(columns), together)]
+    return found
+
+
+def _n_motion(model: Model) -> int:
+    """Number of signals before the sensors."""
+    return len(model.signals) - len(model.sensors)
+
+
 def smooth(model: Model, logs: Sequence[Samples], dt: float, halves: IntArray) -> list[Motion]:
     """Smoothed motion of every log.
 
@@ -131,48 +157,76 @@ def smooth(model: Model, logs: Sequence[Samples], dt: float, halves: IntArray) -
     list of Motion
         The spread of each signal is that over all logs; its unit for one that is at rest.
     """
-    signals = [_smoothed_log(model, log, dt, halves) for log in logs]
-    middle = [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
-    spread = size_or_one(_spread(model, middle))
+    signals = [_smoothed(model, log, dt, halves) for log in logs]
+    middle = _joined(
+        model, [np.where(log.known.any(axis=0), log.centre, x) for log, x in zip(logs, signals, strict=True)]
+    )
+    n = _n_motion(model)
+    spread = np.concatenate([_spread(middle[:, :n]), *map(_spread_of_known, middle[:, n:].T)])
+    spread = np.where(spread > 0.0, spread + 1e-9, 1.0)
     return [Motion(x, spread) for x in signals]
 
 
-def _smoothed_log(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatArray:
+def _smoothed(model: Model, log: Samples, dt: float, halves: IntArray) -> FloatArray:
     """Smoothed signals ``(N, n_signals)`` of all rows of one log; those that it lacks follow from those that it has.
 
     Sensors are smoothed one by one; they are NaN in rows without a sample nearby.
     """
-    measured, known, centre = log.measured.T.copy(), log.known.T.copy(), log.centre.T.copy()
-    signals, spread, (_, N) = np.zeros(measured.shape), _spread(model, [log.centre]), measured.shape
+    measured, known, centre = log.measured, log.known, log.centre
+    signals = np.zeros(measured.shape)
     chains = _chains(model)
 
-    def smoothed(columns: IntArray, derivatives: int = 0) -> FloatArray:
-        samples, half = (measured[columns], known[columns], centre[columns]), int(halves[columns[0, 0]])
-        return _smoothed(*samples, log.gaps, spread[columns], dt, half, derivatives)
+    def smoothed(columns: IntArray, half: int, derivatives: int = 0) -> FloatArray:
+        some = measured[:, columns], known[:, columns], centre[:, columns]
+        return _with_wider_windows(*some, log.gaps, dt, half, derivatives)
 
     if model.kinematics is not None:
-        rates = np.zeros((model.n_q, N))
-        for columns in _alike(chains[: model.n_q], halves, N):
-            parts = smoothed(columns, derivatives=1)
-            signals[columns], rates[columns[:, 0]] = parts[:, :1], parts[:, 1]
+        rates = np.zeros((len(measured), model.n_q))
+        for columns, half in _alike(chains[: model.n_q], halves, 4 * len(measured)):
+            parts = smoothed(columns, half, derivatives=1)
+            signals[:, columns], rates[:, columns[:, 0]] = parts[:, :, :1], parts[:, :, 1]
         _project(model, signals, rates, known)
-        lacking = model.n_q + np.flatnonzero(~known[model.n_q :][: len(model.velocities_of_motion)].any(axis=1))
+        n_x = model.n_q + len(model.velocities_of_motion)
+        lacking = model.n_q + np.flatnonzero(~known[:, model.n_q : n_x].any(axis=0))
         if len(lacking):
-            velocities = _velocities_of_rates(model, signals, rates, np.where(known, measured, np.nan), lacking)
-            measured[lacking], known[lacking], centre[lacking] = velocities, ~log.gaps, velocities
-            spread[lacking] = [_spread_of(x) for x in velocities]
+            inferred = _velocities_of_rates(model, signals, rates, measured, known, lacking)
+            measured, known, centre = measured.copy(), known.copy(), centre.copy()
+            measured[:, lacking], known[:, lacking], centre[:, lacking] = inferred, ~log.gaps[:, None], inferred
         chains = chains[model.n_q :]
-    for columns in _alike(chains, halves, N):
-        signals[columns] = smoothed(columns)
+    for columns, half in _alike(chains, halves, 4 * len(measured)):  # a row is in four windows
+        signals[:, columns] = smoothed(columns, half)
     for chain in chains:
         _integrate(signals, known, chain, dt)
-    for k in range(len(signals) - len(model.sensors), len(signals)):
-        counts = np.cumsum(np.pad(known[k], (halves[k] + 1, halves[k])))
-        signals[k, counts[2 * halves[k] + 1 :] == counts[:N]] = np.nan
-    rows, seen = np.arange(N), np.flatnonzero(~log.gaps)
-    for x in signals if len(seen) else ():
+    for k in range(_n_motion(model), len(model.signals)):
+        near = _near(known[:, k], halves[k])
+        signals[:, [k]] = np.nan
+        if near.any():
+            signals[near, k] = smoothed(np.array([[k]]), halves[k])[near, 0, 0]
+    rows, seen = np.arange(len(signals)), np.flatnonzero(~log.gaps)
+    for x in signals.T if len(seen) else ():
         x[:] = np.interp(rows, seen, x[seen])
-    return signals.T.copy()
+    return signals
+
+
+def _with_wider_windows(
+    values: FloatArray, known: BoolArray, centre: FloatArray, gaps: BoolArray, dt: float, half: int, derivatives: int
+) -> FloatArray:
+    """Smoothed chains, as `_Smoother.smoothed`; rows with too few samples about them are those of wider windows."""
+    found, informed = _Smoother.of(dt, half).smoothed(values, known, centre, derivatives)
+    lacking = ~(informed | gaps[:, None])
+    some = np.flatnonzero(lacking.any(axis=0) & known.any(axis=(0, 2)))
+    if len(some) and _WIDER * half < len(values):
+        wider = _with_wider_windows(
+            values[:, some], known[:, some], centre[:, some], gaps, dt, _WIDER * half, derivatives
+        )
+        found[:, some] = np.where(lacking[:, some, None], wider, found[:, some])
+    return found
+
+
+def _near(known: BoolArray, reach: int) -> BoolArray:
+    """Mask ``(N,)`` of the rows with a known sample at most so many rows away."""
+    counts, rows, n = np.concatenate([[0], np.cumsum(known)]), np.arange(len(known)), len(known)
+    return np.asarray(counts[np.minimum(rows + reach + 1, n)] > counts[np.maximum(rows - reach, 0)])
 
 
 def _project(model: Model, signals: FloatArray, rates: FloatArray, known: BoolArray) -> None:
@@ -180,128 +234,103 @@ def _project(model: Model, signals: FloatArray, rates: FloatArray, known: BoolAr
 
     The error of a polynomial in the four components is of the order of the fit's along the norm, and vanishes there.
     """
-    for four in map(list, model.quaternions):
-        if known[four].any(axis=1).all():
-            norms = size_or_one(np.linalg.norm(signals[four], axis=0))
-            signals[four] /= norms
-            rates[four] /= norms
+    for four in model.quaternions:
+        columns = list(four)
+        if known[:, columns].any(axis=0).all():
+            norms = np.linalg.norm(signals[:, columns], axis=1, keepdims=True)
+            factor = 1.0 / np.where(norms > _FLOOR, norms, 1.0)
+            signals[:, columns] *= factor
+            rates[:, columns] *= factor
 
 
 def _velocities_of_rates(
-    model: Model, signals: FloatArray, rates: FloatArray, measured: FloatArray, lacking: IntArray
+    model: Model, signals: FloatArray, rates: FloatArray, measured: FloatArray, known: BoolArray, lacking: IntArray
 ) -> FloatArray:
-    """Velocities ``(n, N)`` that a log lacks, from the rates of its coordinates by least squares of the kinematics."""
+    """Velocities ``(N, n)`` that a log lacks, from the rates of its coordinates by least squares of the kinematics."""
     n_q, n_v = model.n_q, model.n_v
     q, v = (ca.SX.sym(name, n) for name, n in (("q", n_q), ("v", n_v)))
     assert model.kinematics is not None
     rate = model.kinematics(q, v)
     evaluate = compile_map(ca.Function("rates", [q, v], [ca.densify(rate), ca.densify(ca.jacobian(rate, v))]))
-    at_known, slopes = evaluate(signals[:n_q].T, interpolated(measured[n_q : n_q + n_v].T))
-    seen = np.isfinite(measured[:n_q]).any(axis=1)
-    J = slopes.reshape(-1, n_v, n_q).swapaxes(1, 2)[:, seen][:, :, lacking - n_q]
-    return np.asarray(np.einsum("nvq,nq->vn", np.linalg.pinv(J, rcond=1e-6), (rates.T - at_known)[:, seen]))
+    rows = np.arange(len(signals))
+    v_known = np.zeros((len(signals), n_v))
+    for d in range(n_v):
+        ok = known[:, n_q + d]
+        if ok.any():
+            v_known[:, d] = np.interp(rows, rows[ok], measured[ok, n_q + d])
+    at_known, slopes = evaluate(signals[:, :n_q], v_known)
+    J = slopes.reshape(len(signals), n_v, n_q).swapaxes(1, 2)[:, :, lacking - n_q]
+    seen = known[:, :n_q].any(axis=0)
+    return np.asarray(np.einsum("nvq,nq->nv", np.linalg.pinv(J[:, seen], rcond=1e-6), (rates - at_known)[:, seen]))
 
 
-def _integrate(signals: FloatArray, known: BoolArray, chain: Sequence[int], dt: float) -> None:
+def _integrate(signals: FloatArray, known: BoolArray, columns: Sequence[int], dt: float) -> None:
     """Fill signals below the first of a chain that the log has with its integral, in place: the constant is unknown."""
-    first = next((j for j, k in enumerate(chain) if known[k].any()), 0)
-    for j in range(first, 0, -1):
-        rate = signals[chain[j]]
+    has = [bool(known[:, c].any()) for c in columns]
+    if not any(has):
+        return
+    for j in range(has.index(True), 0, -1):
+        rate = signals[:, columns[j]]
         integral = np.concatenate([[0.0], np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
-        signals[chain[j - 1]] = integral - integral.mean()
+        signals[:, columns[j - 1]] = integral - integral.mean()
 
 
-# ---------------------------------------------------------------------- polynomials
+@dataclass(frozen=True, eq=False, repr=False)
+class _Smoother:
+    """Overlapping windows, whose polynomials are blended; their knots are ``step`` rows apart.
 
-
-def _chains(model: Model) -> list[list[int]]:
-    """Places among the model's signals of each quantity and of its derivatives, and of each sensor alone."""
-    return [[model.signals.index(name) for name in chain] for chain in (*model.chains, *([x] for x in model.sensors))]
-
-
-def _alike(chains: Sequence[Sequence[int]], halves: IntArray, n_rows: int = 0) -> Iterator[IntArray]:
-    """Signals ``(C, c)`` of chains of one length and half width, which are fitted together if a log is not long."""
-    for kind in sorted({(len(x), halves[x[0]]) for x in chains}):
-        columns = np.array([x for x in chains if (len(x), halves[x[0]]) == kind])
-        yield from np.split(columns, range(1, len(columns))) if n_rows > _LONG else [columns]
-
-
-# Rows of a log from which on chains are smoothed one by one, which saves memory.
-_LONG = 10_000
-
-
-def _smoothed(
-    values: FloatArray, known: BoolArray, centre: FloatArray, gaps: BoolArray, spread: FloatArray, dt: float,
-    half: int, derivatives: int,
-) -> FloatArray:  # fmt: skip
-    """Chains ``(C, c + derivatives, N)``: measured ones ``(C, c, N)``, smoothed, and derivatives of their last.
-
-    Rows with no more samples about them than a polynomial has coefficients are those of wider windows.
+    Parameters
+    ----------
+    step : int
+    basis : (4, 2 half + 1, 5) array
+        Polynomials and their derivatives.
+    blend : (2 half + 1,) array
+        Weight of a polynomial by its distance from the knot.
     """
-    (_, c, N), step, basis = values.shape, half // 2, _basis(half, 1, dt)
-    knots = np.arange(0, N + step, step)
-    middle = np.clip(knots, half, max(N - 1 - half, half))  # of windows, which lie within the log
-    rows = middle[:, None] + np.arange(-half, half + 1)
-    samples, rows = known[:, :, np.minimum(rows, N - 1)] & (rows < N), np.minimum(rows, N - 1)
-    coefficients = _coefficients(values[:, :, rows], samples, centre[:, :, rows], basis[:c], spread)
-    informed = samples.any(axis=1).sum(axis=2) > _DEGREE + 1
-    signals, total, rows = np.zeros((len(values), c + derivatives, N)), np.zeros((len(values), 1, N)), np.arange(N)
-    for k in (rows // step, rows // step + 1):
-        of_rows = basis[: c + derivatives, half + rows - middle[k]]
-        weight = (1.0 - np.abs(rows - knots[k]) / step) * np.where(informed[:, k], 1.0, np.finfo(float).eps)
-        signals += weight[:, None] * np.einsum("Cna,jna->Cjn", coefficients[:, k], of_rows)
-        total += weight[:, None]
-    signals /= total
-    lacking = (total < 0.5 / step) & ~gaps
-    some = np.flatnonzero(lacking.any(axis=(1, 2)) & known.any(axis=(1, 2)))
-    if len(some) and _WIDER * half < N:
-        less = values[some], known[some], centre[some], gaps, spread[some]
-        signals[some] = np.where(lacking[some], _smoothed(*less, dt, _WIDER * half, derivatives), signals[some])
-    return signals
 
+    step: int
+    basis: FloatArray
+    blend: FloatArray
 
-def _basis(half: int, stride: int, dt: float) -> FloatArray:
-    """Powers of scaled time and their first three derivatives ``(4, n_t, 5)`` in every so many rows of a window."""
-    t, powers, factor, orders = (
-        np.arange(-half, half + 1, stride) / half,
-        np.arange(_DEGREE + 1),
-        np.ones(_DEGREE + 1),
-        [],
-    )
-    for order in range(4):
-        orders.append(factor * t[:, None] ** np.maximum(powers - order, 0) / (half * dt) ** order)
-        factor = factor * (powers - order)
-    return np.stack(orders)
+    @classmethod
+    def of(cls, dt: float, half: int) -> _Smoother:
+        step, offsets = max(1, half // 2), np.arange(-half, half + 1)
+        return cls(step, _basis(offsets / half, half * dt), np.maximum(0.0, 1.0 - np.abs(offsets) / (step + 1.0)))
 
+    def smoothed(
+        self, values: FloatArray, known: BoolArray, centre: FloatArray, derivatives: int
+    ) -> tuple[FloatArray, BoolArray]:
+        """Signals ``(N, C, c + derivatives)`` of C chains of c signals, and further derivatives of their last.
 
-def _coefficients(
-    values: FloatArray, known: BoolArray, centre: FloatArray, basis: FloatArray, spread: FloatArray
-) -> FloatArray:
-    """Coefficients ``(C, K, 5)`` of the polynomials of chains ``(C, c, K, n_t)`` by reweighted least squares."""
-    products = (basis[:, :, :, None] * basis[:, :, None, :]).reshape(*basis.shape[:2], -1)
-    residuals, scale, floor = values - centre, np.zeros(spread.shape), _FLOOR * size_or_one(spread)
-    for _ in range(_PASSES):
-        scale = np.fmax(np.fmax(_scale(residuals, known), floor), _SHRINK * scale)
-        s = scale[:, :, None, None]
-        weights = known / np.square(s * (1.0 + np.square(residuals / (3.0 * s))))
-        G = (weights @ products).sum(axis=1).reshape(len(values), -1, _DEGREE + 1, _DEGREE + 1)
-        h = ((weights * values) @ basis).sum(axis=1)
-        d = np.sqrt(np.einsum("ckii->cki", G)) + 1e-12
-        G = G / d[..., None] / d[..., None, :] + 1e-9 * np.eye(_DEGREE + 1)
-        coefficients = np.linalg.solve(G, (h / d)[..., None])[..., 0] / d
-        residuals = values - coefficients[:, None] @ basis.swapaxes(1, 2)
-    return np.asarray(coefficients)
+        A mask ``(N, C)`` is that of the rows in a window with more samples than its polynomial has coefficients.
+        """
+        (N, C, c), n, n_t = values.shape, values.shape[2] + derivatives, len(self.blend)
+        some, oks, about = self._windows(values), self._windows(known), self._windows(centre)
+        coefficients = _coefficients(some, oks, about, self.basis[:c], _spread(centre))
+        log, of_rows = slice(n_t // 2, n_t // 2 + N), np.zeros((C, 1 + n, (oks.shape[1] + 1) * self.step + n_t))
+        for i, (own, ok) in enumerate(zip(coefficients, oks, strict=True)):
+            for knots in row_blocks(len(ok), max(1, 8 * _NUMBERS_TOGETHER // ok[0].size)):
+                fitted = np.einsum("ka,jta->ktj", own[knots], self.basis[:n])
+                enough = ok[knots].any(axis=2).sum(axis=1) > _DEGREE + 1
+                weight = self.blend * np.where(enough, 1.0, _UNINFORMED)[:, None]
+                self._add(of_rows[i, 0, knots.start * self.step :], weight)
+                for j in range(n):
+                    self._add(of_rows[i, 1 + j, knots.start * self.step :], fitted[:, :, j] * weight)
+        of_rows = of_rows[:, :, log]
+        of_rows[:, 1:] /= of_rows[:, :1]
+        return np.moveaxis(of_rows[:, 1:], 2, 0), (of_rows[:, 0] > _UNINFORMED * n_t).T
 
+    def _windows(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Views ``(C, K, n_t, c)`` of chains ``(N, C, c)`` about every knot; no sample is known beyond the log."""
+        wide = (0, 0), (len(self.blend) // 2,) * 2, (0, 0)
+        rows = np.pad(np.moveaxis(values, 1, 0), wide, mode="constant" if values.dtype == bool else "edge")
+        return np.moveaxis(sliding_window_view(rows, len(self.blend), axis=1)[:, :: self.step], 3, 2)
 
-def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
-    """Robust standard deviation ``(C, c)`` of residuals ``(C, c, K, n_t)``; NaN where nothing is measured."""
-    every = max(1, residuals[0, 0].size // _ENOUGH)
-    flat = (*residuals.shape[:2], -1)
-    some, mask = residuals[:, :, ::every].reshape(flat), known[:, :, ::every].reshape(flat)
-    return np.asarray(lower_scale(some.swapaxes(1, 2), mask.swapaxes(1, 2)))
-
-
-# ---------------------------------------------------------------------- half widths
+    def _add(self, rows: FloatArray, windows: FloatArray) -> None:
+        """Add windows ``(K, n_t)`` of successive knots to rows from the first of the first one on, knot by knot."""
+        for t in reversed(range(0, windows.shape[1], self.step)):
+            some = windows[:, t : t + self.step]
+            rows[t : t + len(some) * self.step].reshape(len(some), -1)[:, : some.shape[1]] += some
 
 
 def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowest: float) -> tuple[IntArray, int]:
@@ -326,70 +355,162 @@ def choose_half_widths(model: Model, logs: Sequence[Samples], dt: float, narrowe
     length : int
         Rows in which signals move as little as in the half width of the fastest one; of the usual one at least.
     """
-    motion = [k for chain in model.chains for k in map(model.signals.index, chain)]
-    apart = np.ones(len(model.signals), int)
-    for chain in _chains(model):
-        apart[chain] = _rows_apart(logs, chain)
+    chains, n_motion = _chains(model), _n_motion(model)
+    longest, apart = max(len(log.measured) for log in logs), np.ones(len(model.signals), int)
+    for columns in (*chains, *([k] for k in range(n_motion, len(model.signals)))):
+        apart[columns] = max(rows_per_sample(np.asarray(log.known[:, columns].any(axis=1))) for log in logs)
+    together = max(rows_per_sample(np.asarray(log.known[:, :n_motion].any(axis=1))) for log in logs)
     usual, length = (
-        np.maximum((_DEGREE + 1) * x, np.minimum(round(narrowest / dt), _MOST * x))
-        for x in (apart, _rows_apart(logs, motion))
+        np.maximum(_FEWEST * x, np.minimum(round(narrowest / dt), _ENOUGH_SAMPLES * x)) for x in (apart, together)
     )
-    longest = max(len(log.measured) for log in logs)
     factors = [k for k in range(20) if k == 0 or 8 * length * _WIDER**k < longest]
-    candidates = [np.maximum(usual // _WIDER, (_DEGREE + 1) * apart), *(usual * _WIDER**k for k in factors)]
-    errors = [_prediction_errors(model, logs, dt, halves, usual, apart) for halves in candidates]
-    best = 1 + int(np.argmin([np.nansum(np.log(x)) for x in errors[1:]]))
+    candidates = [np.maximum(usual // _WIDER, _FEWEST * apart), *(usual * _WIDER**k for k in factors)]
+    spread = _spread(_joined(model, [log.centre for log in logs]))
+    tried = [_prediction_errors(model, logs, dt, halves, usual, apart, spread) for halves in candidates]
+    best = 1 + int(np.argmin([np.log(errors).sum() for errors, _ in tried[1:]]))
     # Narrower windows have noisier derivatives: they are taken where the others miss a visible part of the motion.
-    first = [next((k for k in chain if np.isfinite(errors[0][k])), chain[0]) for chain in _chains(model)]
-    narrow, wide = (np.nansum(np.log(np.maximum(errors[k][first], _VISIBLE))) for k in (0, best))
-    best = 0 if narrow < wide else best
+    visible = [float(np.log(np.maximum(first, _VISIBLE)).sum()) for _, first in tried]
+    best = 0 if visible[0] < visible[best] else best
     return candidates[best], int(length) * _WIDER ** max(best - 1, 0)
 
 
-def _rows_apart(logs: Sequence[Samples], columns: Sequence[int]) -> int:
-    """Rows from one sample of any of some signals to the next, in the log where they are slowest."""
-    return max(rows_per_sample(np.asarray(log.known[:, columns].any(axis=1))) for log in logs)
-
-
 def _prediction_errors(
-    model: Model, logs: Sequence[Samples], dt: float, halves: IntArray, usual: IntArray, apart: IntArray
-) -> FloatArray:
-    """Robust scale of left-out samples over the spread of each signal; NaN of a signal without samples, and sensors."""
+    model: Model,
+    logs: Sequence[Samples],
+    dt: float,
+    halves: IntArray,
+    usual: IntArray,
+    apart: IntArray,
+    sizes: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Robust scale of the left-out samples over a signal's spread: of each signal, and of the first of each chain."""
     measured, known, centre = (
-        np.concatenate([getattr(log, name) for log in logs]).T for name in ("measured", "known", "centre")
+        np.concatenate([getattr(log, name) for log in logs]) if len(logs) > 1 else getattr(logs[0], name)
+        for name in ("measured", "known", "centre")
     )
-    spread, errors = size_or_one(_spread(model, [log.centre for log in logs])), np.full(len(measured), np.nan)
-    ends = np.cumsum([len(log.measured) for log in logs])
-    for columns in _alike(_chains(model)[: len(model.chains)], halves):
-        k, half = columns[0, 0], int(halves[columns[0, 0]])
+    found, first_of_chains = list[FloatArray](), list[float]()
+    for columns, half in _alike(_chains(model), halves, _TRIALS * (2 * int(usual.max()) + 1)):
+        k = columns[0, 0]
         stride = max(1, half // usual[k]) if apart[k] == 1 else 1
-        offsets, basis = np.arange(-half, half + 1, stride), _basis(half, stride, dt)[: columns.shape[1]]
-        knots = np.linspace(0, ends[-1] - 1, _TRIALS * max(1, usual[k] // half)).astype(int)
-        begin, end = (np.concatenate([[0], ends])[np.searchsorted(ends, knots, "right") + x] for x in (0, 1))
-        middle = np.clip(knots, begin + half, np.maximum(end - 1 - half, begin + half))
-        rows = np.clip(middle[:, None] + offsets, begin[:, None], end[:, None] - 1)
-        values, oks, about = (x[columns][:, :, rows] for x in (measured, known, centre))
-        every_other = np.cumsum(oks, axis=3) % 2 == 1
-        coefficients = _coefficients(values, oks & every_other, about, basis, spread[columns])
-        fitted = coefficients[:, None] @ basis.swapaxes(1, 2)
-        scale = _scale(values - fitted, oks & ~every_other & (np.abs(offsets) <= half // 2))
-        errors[columns] = np.where(oks.any(axis=(2, 3)), np.fmax(scale / spread[columns], _FLOOR), np.nan)
-    return errors
+        offsets = np.arange(-half, half + 1, stride)
+        rows = _trial_rows([len(log.measured) for log in logs], _TRIALS * max(1, usual[k] // half), half, offsets)
+        near = np.abs(offsets) <= half // 2
+        basis = _basis(offsets / half, half * dt)
+        values, oks, about = (np.moveaxis(x[:, columns][rows], 2, 0) for x in (measured, known, centre))
+        spread, even, orders = sizes[columns], _every_other(oks), basis[: columns.shape[1]]
+        coefficients = _coefficients(values, oks & even, about, orders, spread)
+        fitted = np.einsum("Cka,jta->Cktj", coefficients, orders)
+        tested, n = oks & near[:, None] & ~even, oks.shape[1] * oks.shape[2]
+        scale = _scale(_sampled([values - fitted], n), _sampled([tested], n))
+        seen: BoolArray = np.asarray(oks.any(axis=(1, 2)))
+        errors = np.maximum(scale, _FLOOR * spread + 1e-12) / (spread + 1e-12)
+        found.append(errors[seen])
+        first_of_chains += [float(own[ok][0]) for own, ok in zip(errors, seen, strict=True) if ok.any()]
+    return np.concatenate(found), np.array(first_of_chains)
 
 
-def _spread(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
-    """Robust standard deviation ``(n_signals,)`` over logs, of coordinates about the median of each log."""
-    if len(logs) > 1:
-        centred = np.arange(len(model.signals)) < model.n_q
-        logs = [x - np.where(centred, np.median(x, axis=0), 0.0) for x in logs]
-    return np.array([_spread_of(x) for x in np.concatenate(logs).T])
+def _every_other(known: BoolArray) -> BoolArray:
+    """Every other row ``(C, K, n_t, c)``, and of the samples of slow signals every other one."""
+    rows = np.arange(known.shape[2])[:, None] % 2 == 0
+    slow = known.mean(axis=(1, 2), keepdims=True) < 0.5
+    return np.asarray(np.where(slow, np.cumsum(known, axis=2) % 2 == 1, rows) if slow.any() else rows)
 
 
-def _spread_of(values: FloatArray) -> float:
-    """Standard deviation of finite values by the MAD; by the central 80 % where half are one value."""
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return 0.0
-    low, median, high = np.quantile(values, [0.1, 0.5, 0.9])
-    mad, wide = float(robust_std(values - median)), float(high - low) / 2.563
-    return mad if mad > 0.1 * wide else wide
+def _joined(model: Model, logs: Sequence[FloatArray]) -> FloatArray:
+    """Signals of all logs, of which spreads are taken: coordinates of several logs about the median of their log."""
+    if len(logs) == 1:
+        return logs[0]
+    centred = np.arange(len(model.signals)) < model.n_q
+    return np.concatenate([x - np.where(centred, np.median(x, axis=0), 0.0) for x in logs])
+
+
+def _trial_rows(sizes: Sequence[int], trials: int, half: int, offsets: IntArray) -> IntArray:
+    """Rows (K, n_offsets) about so many knots, spread over logs of so many rows in proportion to their length."""
+    rows, begin = [], 0
+    for N in sizes:
+        n_trials = max(1, round(trials * N / sum(sizes)))
+        knots = np.linspace(min(half, N // 2), max(N - 1 - half, N // 2), n_trials).astype(int)
+        rows.append(begin + np.clip(knots[:, None] + offsets, 0, N - 1))
+        begin += N
+    return np.concatenate(rows)
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """Standard deviation of each column by the MAD; by the central 80 % where half the samples have one value."""
+
+    def of_one(own: FloatArray) -> float:
+        low, median, high = np.quantile(own, [0.1, 0.5, 0.9])
+        mad, wide = float(robust_std(own - median)), float(high - low) / 2.563
+        return mad if mad > _AT_REST * wide else wide
+
+    return np.apply_along_axis(of_one, 0, values)
+
+
+def _spread_of_known(values: FloatArray) -> FloatArray:
+    """Spread ``(1,)`` of the finite values of a signal; 0 without any."""
+    known = values[np.isfinite(values)]
+    return _spread(known[:, None]) if len(known) else np.zeros(1)
+
+
+def _basis(t: FloatArray, unit: float) -> FloatArray:
+    """Powers of scaled time and their first three derivatives, (4, n_t, 5)."""
+    powers, factor, orders = np.arange(_DEGREE + 1), np.ones(_DEGREE + 1), []
+    for order in range(4):
+        orders.append(factor * t[:, None] ** np.maximum(powers - order, 0) / unit**order)
+        factor = factor * (powers - order)
+    return np.stack(orders)
+
+
+def _coefficients(
+    values: FloatArray, known: BoolArray, centre: FloatArray, basis: FloatArray, spread: FloatArray
+) -> FloatArray:
+    """Coefficients ``(C, K, 5)`` of the polynomials of C chains of c signals, ``(C, K, n_t, c)``."""
+    C, K, n_t, c = values.shape
+    floor = _FLOOR * spread + 1e-12
+    products = np.einsum("jta,jtb->tjab", basis, basis).reshape(n_t * c, -1)
+    flat = basis.swapaxes(0, 1).reshape(n_t * c, -1)
+    found = np.empty((C, K, _DEGREE + 1))
+    blocks = list(row_blocks(K, max(1, 8 * _NUMBERS_TOGETHER // (C * n_t * c))))  # of three signals, some 60,000 rows
+    seen = _sampled((known[:, k] for k in blocks), K * n_t)
+
+    @lru_cache(maxsize=1)
+    def left(i: int, step: int) -> FloatArray:
+        """Residuals ``(C, K, n_t, c)`` of a block before a step: of the last one's polynomials, or of the centre."""
+        of = blocks[i]
+        fitted = (found[:, of].reshape(-1, _DEGREE + 1) @ flat.T).reshape(C, -1, n_t, c) if step else centre[:, of]
+        return np.asarray(values[:, of] - fitted)
+
+    scale = np.zeros((C, c))
+    for step in range(_STEPS):
+        own = _scale(_sampled((left(i, step) for i in range(len(blocks))), K * n_t), seen)
+        scale = np.maximum(np.maximum(own, floor), _SHRINK * scale)
+        for i, k in enumerate(blocks):
+            weights = left(i, step).reshape(C, -1, n_t * c)
+            weights *= np.tile(1.0 / (3.0 * scale), n_t)[:, None]
+            weights *= weights
+            weights += 1.0
+            weights *= weights
+            weights *= np.tile(np.square(scale), n_t)[:, None]
+            np.divide(known[:, k].reshape(weights.shape), weights, out=weights)
+            G = (weights.reshape(-1, n_t * c) @ products).reshape(-1, _DEGREE + 1, _DEGREE + 1)
+            weights *= values[:, k].reshape(weights.shape)
+            h = weights.reshape(-1, n_t * c) @ flat
+            d = np.sqrt(np.einsum("kii->ki", G)) + 1e-12
+            G = G / d[:, :, None] / d[:, None, :] + 1e-9 * np.eye(_DEGREE + 1)
+            found[:, k] = (np.linalg.solve(G, (h / d)[:, :, None])[:, :, 0] / d).reshape(C, -1, _DEGREE + 1)
+    return found
+
+
+def _sampled(blocks: Iterable[NDArray[Scalar]], n: int) -> NDArray[Scalar]:
+    """Every so many of the n rows of all windows, ``(C, m, c)``; blocks are ``(C, K, n_t, c)``, one after the other."""
+    every, at, found = max(1, n // _ENOUGH) | 1, 0, []
+    for one in blocks:
+        rows = one.reshape(len(one), -1, one.shape[3])
+        found.append(rows[:, -at % every :: every])
+        at += rows.shape[1]
+    return np.concatenate(found, axis=1)
+
+
+def _scale(residuals: FloatArray, known: BoolArray) -> FloatArray:
+    """Robust standard deviation ``(C, c)`` of each chain's signals; one where nothing is measured."""
+    return np.nan_to_num(lower_scale(residuals, known), nan=1.0, posinf=np.inf)

@@ -11,8 +11,10 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.errors import IdentificationError, LogError, SettingsError
+from diransac.identification.core.rows import Rows, inclusive_bounds, solve
 from diransac.identification.methods.lo_diransac.segments import ActingInputs
 from diransac.identification.regression.estimators import OrdinaryLeastSquares
+from diransac.identification.regression.rows import regression
 from diransac.identification.regression.uncertainty import student_quantile
 from diransac.time_limit import check_time
 
@@ -116,6 +118,8 @@ def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blo
         own = Dataset.of(model, logs if complete else [differentiate(x, model) for x in logs])
     except (LogError, SettingsError):
         return
+    if len(own.layout) != len(dataset.layout):  # sensors have parameters of their own
+        return
     own = replace(own, layout=dataset.layout)
     block = _blocks_of_rows(own, dataset, intervals, blocks)
     for name in ("ols", "nls") if model.is_affine else ("nls",):
@@ -137,11 +141,16 @@ def _blocks_of_rows(own: Dataset, dataset: Dataset, intervals: ShootingIntervals
 
 
 def _ordinary(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray, FloatArray]:
-    """Ordinary least squares of all rows and without each block."""
+    """Ordinary least squares within the bounds, of all rows and without each block: to first order on a bound."""
     bound = OrdinaryLeastSquares().bind(own)
     rows = np.arange(bound.n_rows)
     groups = [np.flatnonzero(block == k) for k in range(n_blocks)]
-    return bound.select([rows]).fit()[0], bound.fit_without(groups, rows)
+    p, without = bound.select([rows]).fit()[0], bound.fit_without(groups, rows)
+    lower, upper = inclusive_bounds(own.layout.bounds, zero=True)
+    if ((p >= lower) & (p <= upper)).all():
+        return p, without
+    within = solve(Rows(*regression(own)), bounds=(lower, upper)).p
+    return within, np.clip(within + without - p, lower, upper)
 
 
 def _nonlinear(own: Dataset, block: IntArray, n_blocks: int) -> tuple[FloatArray, FloatArray]:

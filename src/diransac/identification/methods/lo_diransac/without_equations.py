@@ -169,7 +169,7 @@ def followed(
 
 def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, tuple[str, ...]]:
     """Intervals of the logs, and findings of the screening.  Raises LogError: the logs are too short."""
-    samples, notes = screened(settings, dataset)
+    samples, notes = screened(dataset)
     length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), 5, 25))
     n_rows, least = sum(map(len, dataset.segments)), FEWEST_INTERVALS * length
     if n_rows < least:
