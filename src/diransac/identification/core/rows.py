@@ -24,7 +24,7 @@ _ROUNDING = 1e-9
 _SINGULAR = 1e-10
 """Eigenvalue of the information in columns of unit size, over their number, of a direction without information."""
 _CONVERGED = 1e-4
-"""Change of the parameters, over the largest, from which on reweighting goes on; columns have unit size."""
+"""Relative change of a parameter from which on reweighting goes on."""
 _NUMBERS_AT_A_TIME = 1_000_000
 """Numbers that are held at a time for several sets of rows: bounds the memory, whatever the length of the logs."""
 
@@ -237,8 +237,7 @@ def _reweighted(
         columns = np.concatenate([rows.W, rows.b[:, :, None]], axis=2)
         size = np.linalg.norm(columns / size_or_one(np.sqrt(np.square(columns).mean(axis=(0, 1)))), axis=2)
         factor = 1.0 / (1.0 + size / (np.median(size) + np.finfo(float).tiny))
-    scale = size_or_one(np.sqrt(np.square(rows.W * weights[:, :, None]).mean(axis=(0, 1))))
-    p = np.zeros(len(scale))
+    p = np.zeros(rows.W.shape[2])
     for left in range(loss.steps if loss else 0, -1, -1):
         before, square = p, np.square(weights * factor)
         weighted = rows.W * square[:, :, None]
@@ -248,8 +247,7 @@ def _reweighted(
         if not (np.isfinite(G).all() and np.isfinite(h).all()):
             raise np.linalg.LinAlgError("rows of the equations are not finite")
         (p,), (inverse,) = _solution(G[None], h[None])
-        change, largest = (np.abs(x * scale).max(initial=0.0) for x in (p - before, p))
-        if loss is None or left == 0 or change <= _CONVERGED * largest:
+        if loss is None or left == 0 or (np.abs(p - before) <= _CONVERGED * np.abs(p)).all():
             break
         factor = loss.weights(rows.residuals(p) * weights, used)
     return p, inverse, weights * factor
@@ -278,9 +276,10 @@ def _solution(G: FloatArray, h: FloatArray) -> tuple[FloatArray, FloatArray]:
     G = np.where(finite[:, None, None], G, 0.0)
     d = size_or_one(np.sqrt(np.einsum("kii->ki", G)))
     inverse = np.linalg.pinv(G / d[:, :, None] / d[:, None, :], rcond=_SINGULAR, hermitian=True)
-    inverse = inverse / d[:, :, None] / d[:, None, :]
-    p = np.where(finite[:, None], (inverse @ h[:, :, None])[:, :, 0], np.nan)
-    return p, inverse
+    z = (inverse @ (h / d)[:, :, None])[:, :, 0]
+    z[np.abs(z) < np.finfo(float).eps * np.abs(z).max(axis=1, initial=0.0, keepdims=True)] = 0.0  # rounding of none
+    p = np.where(finite[:, None], z / d, np.nan)
+    return p, inverse / d[:, :, None] / d[:, None, :]
 
 
 def _connected(W: FloatArray) -> BoolArray:

@@ -63,7 +63,7 @@ def _observer(model: Model, free: tuple[str, ...], observed: tuple[str, ...], sa
         if name in sampled:
             return (2.0 if name in coordinate_of.values() else 1.0) * b * (u[name] - x[name])
         source = coordinate_of.get(name)
-        return b**2 * (u[source] - x[source]) if source in sampled else ca.SX(0)
+        return b**2 * (u[source] - x[source]) if source in sampled and source in x else ca.SX(0)
 
     def equations(_q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[object]:
         states, acting, parameters = arguments(v, u, p)

@@ -24,7 +24,6 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.units import conversion, one_turn
 from diransac.identification.core.rows import Rows, inclusive_bounds
-from diransac.identification.regression.nonlinear import solved_nonlinear
 from diransac.identification.regression.rows import (
     EXACT,
     MotionRows,
@@ -205,6 +204,8 @@ class CorrectionTests:
         self, model: Model, parts: Sequence[MotionRows], held: Sequence[BoolArray]
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Parameters, no errors, and residuals of accelerations over their sizes."""
+        from diransac.identification.regression.nonlinear import solved_nonlinear
+
         pairs = list(zip(parts, held, strict=True))
         fitted, predicted = (
             [Correction().of_rows(model, x, np.flatnonzero(mask == which)) for x, mask in pairs]

@@ -15,6 +15,7 @@ Ljung 1999, section 5.1 (output error); Ribeiro et al. 2020 (segments that grow)
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING
@@ -340,9 +341,14 @@ class _Solution:
         return found if found.cost < self.cost else self
 
     def descended(self, limit: int = _STEPS, rival: float = np.inf) -> _Solution:
-        """The solution after some steps, each with an update of the noise (EM); a rival as of `minimise`."""
+        """The solution after some steps, each with an update of the noise (EM); a rival as of `minimise`.
+
+        It stays as it is where squares of its derivatives overflow.
+        """
         schedule = SegmentsApart(outliers=bool(self.fit.noise.pi.any()))
-        return replace(self, fit=minimise(self.windows, self.fit, schedule, limit, rival).fit)
+        with suppress(np.linalg.LinAlgError):
+            return replace(self, fit=minimise(self.windows, self.fit, schedule, limit, rival).fit)
+        return self
 
     def grown(self, length: int) -> _Solution:
         """The solution over all segments of a length, of which states and noise are their own."""
