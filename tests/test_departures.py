@@ -64,8 +64,7 @@ def test_an_arm_in_the_hand_is_found_and_right_once_that_is_left_out(tmp_path):
     rest = dr.leave_out(log, found)
     second = dr.identify(MODEL, rest, differentiate=True)
     assert not said(second)
-    assert worst(second) < 0.02
-    assert worst(second) < worst(first)
+    assert worst(second) < 0.005
     done = run("inspect", tmp_path / "arm.csv", f"--leave-out={option}")
     assert "rows are left out, as asked" in done.stdout
 
