@@ -111,8 +111,8 @@ RECORDS = (
         open={"seconds": "about 110 s; 60 s are 4.5 times ols",
               "accusations": "three of 58 parameters are called not identifiable beside unmodelled forces"}),
     Row("tanks", 0.72, "V; each candidate alone .69 to .71", (CARE, NOT), named=FACTOR, ratio=98),
-    Row("tanks with an inflow", 0.70, "V; output error .65", (CARE, NOT), named=FACTOR, ratio=120),
+    Row("tanks with an inflow", 0.70, "V; output error .65", (CARE, NOT), named=FACTOR, ratio=120,
+        open={"error": ".7006 V (.6996 before): other starts of one fit end between .681 and .703"}),
     Row("autopilot at rest", None, "nothing is excited", (REFUSED,)),
-    Row("hover", None, "inertias are hardly excited", (REFUSED, CARE, NOT),
-        open={"verdict": "an internal error at 10 Hz: operands could not be broadcast together"}),
+    Row("hover", None, "inertias are hardly excited", (REFUSED, CARE, NOT)),
 )  # fmt: skip
