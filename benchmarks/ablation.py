@@ -39,6 +39,7 @@ from diransac.study import trial_data
 from simulated import MACHINES, as_log, flight
 
 METHOD = "diransac.identification.methods.lo_diransac"
+CORE, IN_CORE = "diransac.identification.core", ("minimise._CORRECTED",)
 DEFAULT = dr.LoDiransac()
 REAL = "pendulum-A0-one-run,emps,silverbox,crazyflie-log15,go2-RL,go2-RR"
 CHANGED, LEAST = 0.1, 1e-4
@@ -55,7 +56,8 @@ class Part:
 
     def left_out(self) -> list[AbstractContextManager[object]]:
         """Contexts in which the part is missing."""
-        return [patch(f"{METHOD}.{name}", value) for name, value in self.patches]
+        places = {name: f"{CORE if name in IN_CORE else METHOD}.{name}" for name, _ in self.patches}
+        return [patch(places[name], value) for name, value in self.patches]
 
     def __add__(self, other: Part) -> Part:
         """Both parts left out."""
@@ -77,7 +79,10 @@ def _parts() -> dict[str, Part]:
         "finer intervals": Part(patches=(("local_search.fewest_parts", lambda _: 0),)),
         "errors of recordings": Part(replace(DEFAULT, **off)),
         "errors must explain forces": Part(
-            patches=(("local_search._EXPLAINS", -np.inf), ("local_search._EXPLAINS_DRIFT", -np.inf))
+            patches=(
+                ("local_search._EXPLAINS", -np.inf),
+                ("local_search._EXPLAINS_DRIFT", -np.inf),
+            )
         ),
         "screening": Part(patches=(("preparation.stuck_rows", lambda x: np.zeros(len(x), bool)),)),
         "robust loss of the projection": Part(patches=(("projection.CAUCHY", None),)),
@@ -91,7 +96,7 @@ def _parts() -> dict[str, Part]:
         ),
         "prediction of forces": Part(patches=(("judge._EXPLAINED", 0.0),)),
         "prediction of whole logs": Part(patches=(("forward._LONGEST", 0),)),
-        "second-order correction of steps": Part(patches=(("gauss_newton._CORRECTED", 0.0),)),
+        "second-order correction of steps": Part(patches=(("minimise._CORRECTED", 0.0),)),
         "fewer integration steps": Part(patches=(("integration_steps._FEW", ()),)),
     }
 

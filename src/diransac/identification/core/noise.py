@@ -10,26 +10,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, row_blocks
 from diransac.simulation.compiler import order_statistics, padded_rows
 
-if TYPE_CHECKING:
-    pass
-
-# A scale that holds while fewer than 65 % of the residuals are outliers: the 35 % quantile of |r|, and what it is of a
-# standard normal variable.
-_BREAKDOWN, _OF_NORMAL = 0.35, 0.4538
+_BREAKDOWN = 0.35
+"""Quantile of the sizes of residuals that is a scale while fewer than 65 % of them are outliers."""
+_OF_NORMAL = 0.4538
+"""That quantile of a standard normal variable."""
 _FEWEST = 5
+"""Samples of which a scale is estimated at least."""
 _SHRINK = 0.4
+"""Least factor of a scale in a step, so that large residuals keep some weight at first."""
 _FRACTION = (0.002, 0.95)
-# Rows of which densities are computed at a time: they stay in the cache.
+"""Least and largest fraction of outliers."""
 _ROWS_AT_A_TIME = 4096
-# Sigmas from which on exp(-x^2 / 2) is 0 in double precision.
+"""Rows of which densities are computed at a time: they stay in the cache."""
 _FAR = 40.0
+"""Standard deviations from which on ``exp(-x^2 / 2)`` is 0 in double precision."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

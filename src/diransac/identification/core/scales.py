@@ -23,12 +23,13 @@ SHRINK = 0.4
 """Largest change of any scale in a step."""
 CONTINUITY = 0.03
 """Jumps over the effect of tau in an interval: as small a part of it is exact for practical purposes."""
-# Jumps of its states over the states' standard errors, all jumps together.  Continuity that is much tighter would make
-# the information of a log smaller than the rounding errors, and the ridge, of the normal equations.
 _UNBROKEN = 0.01
-_CHANCE, _TINY = 2.0, 1e-300
-# Correlation of unmodelled accelerations from interval to interval at most.
+"""Jumps over the standard errors of the states, all jumps together.  Tighter continuity would make the information of a
+log smaller than the rounding errors, and the ridge, of the normal equations."""
+_CHANCE = 2.0
+"""Standard errors by which accelerations must exceed what noise hides."""
 _MOST_ALIKE = 0.98
+"""Largest correlation of unmodelled accelerations from window to window."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,7 +97,7 @@ class ProcessSums:
         now : (n_v,) array
             Present size, from which it changes by no more than a scale does in a step.
         """
-        weight = np.maximum(self.weight, _TINY)
+        weight = np.maximum(self.weight, np.finfo(float).tiny)
         hidden = 1.0 - np.square(now) * np.sqrt(weight / np.maximum(self.count, 1.0))
         alike = np.minimum(self.cross, _MOST_ALIKE * weight) / weight
         chance = np.sqrt(2.0 / weight * (1.0 + alike) / (1.0 - alike))

@@ -313,8 +313,7 @@ def _ratio(pairs: Sequence[tuple[FloatArray, FloatArray, float]], order: int) ->
         large = np.abs(x) > max(float(np.median(np.abs(x))), tiny)
         ratios = y[large] / x[large]
         middle = float(np.median(ratios)) if len(ratios) else 0.0
-        scatter = float(np.median(np.abs(ratios - middle))) / (abs(middle) + tiny) if len(ratios) else np.inf
-        if scatter < least:
+        if middle and (scatter := float(np.median(np.abs(ratios / middle - 1.0)))) < least:
             least, found = scatter, [middle]
     return found
 

@@ -27,14 +27,18 @@ from diransac.identification.regression.multistart import least_squares
 from diransac.identification.structure.structural import Ranges
 from diransac.model import Model
 
-# Number of frequencies, over the fastest and beyond the slowest eigenvalue.
-_N_FREQUENCIES, _BEYOND = 8, 3.0
-# Starts, fewer of large models: elements of their matrices together; spread of the starts, the logarithm of a factor;
-# steps; slope over the largest of a parameter that a response shows.
-_STARTS, _ELEMENTS, _SPREAD, _N_STEPS, _SHOWN = (8, 48), 6000, 1.5, 40, 1e-6
-# Relative error of a transfer function up to which it is equal; relative change of a parameter that is another one.
-_EQUAL, _OTHER = 1e-7, 0.02
-_SEED, _ROUNDING = 20240607, 1e-12
+_N_FREQUENCIES = 8
+"""Frequencies at which transfer functions are compared."""
+_BEYOND = 3.0
+"""Factor by which frequencies reach beyond the slowest and the fastest eigenvalue."""
+_STARTS = (8, 48)
+"""Fewest and most random starts."""
+_ELEMENTS = 6000
+"""Elements of the matrices of all starts together: large models have fewer starts."""
+_EQUAL = 1e-7
+"""Relative error of a transfer function up to which it is equal."""
+_OTHER = 0.02
+"""Relative change of a parameter that is another one."""
 Response = Callable[[FloatArray], FloatArray]
 
 
@@ -66,12 +70,12 @@ def equivalent_parameters(
         known = np.flatnonzero(parameters)
         _, slopes = _SameResponse(response, parameters, known).slopes(np.zeros((1, len(known))))
         size = np.nan_to_num(np.abs(slopes[0])).max(axis=0, initial=0.0)
-        problem = _SameResponse(response, parameters, known[size > _SHOWN * size.max(initial=0.0)])
+        problem = _SameResponse(response, parameters, known[size > 1e-6 * size.max(initial=0.0)])
         if not len(problem.free):
             return []
-        n, rng = len(problem.free), np.random.default_rng(_SEED)
+        n, rng = len(problem.free), np.random.default_rng(0)
         n_starts = int(np.clip(_ELEMENTS // ((n + 1) * len(model.state) ** 2), *_STARTS))
-        z, cost = least_squares(problem, _SPREAD * rng.standard_normal((n_starts, n)), _N_STEPS)
+        z, cost = least_squares(problem, 1.5 * rng.standard_normal((n_starts, n)), 40)
     found = [parameters]
     for one in problem.at(z[cost < np.square(_EQUAL) * slopes.shape[1]]):
         if not any(is_close(one, x).all() for x in found):
@@ -116,7 +120,7 @@ def _response(model: Model, parameters: FloatArray, measured: Sequence[str], ran
 
     A, *_ = slopes(parameters[None])
     rates = np.abs(np.linalg.eigvals(np.nan_to_num(A))).ravel()
-    rates = rates[rates > _ROUNDING * rates.max(initial=0.0)]
+    rates = rates[rates > 1e-12 * rates.max(initial=0.0)]
     slowest, fastest = (rates.min(), rates.max()) if len(rates) else (1.0, 1.0)
     s = 1j * np.geomspace(slowest / _BEYOND, fastest * _BEYOND, _N_FREQUENCIES)[:, None, None, None]
 

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
     from diransac.identification.core.windows import ShootingIntervals
 
-# Change of a parameter, standard errors, that adds half a per cent to its uncertainty, and of the cost, nats.
-_NEGLIGIBLE, _NEGLIGIBLE_COST = 0.1, 0.5
-# Numbers of steps that are tried; one would need machine code of its own.
+_NEGLIGIBLE = 0.1
+"""Change of a parameter, standard errors, that adds half a per cent to its uncertainty."""
+_NEGLIGIBLE_COST = 0.5
+"""Change of the cost, nats."""
 _FEW = (2, 3)
+"""Numbers of steps that are tried; one would need machine code of its own."""
 
 
 def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tuple[ShootingIntervals, Fit]:

@@ -63,10 +63,12 @@ _SHORTEST = 3
 """Shortest interval, samples."""
 _MOST_ERRORS = 8
 """Errors of recordings that the settings do not name, at most."""
-# Log of the factor by which an error of a recording, and a drift, must lower unmodelled accelerations.
-_EXPLAINS, _EXPLAINS_DRIFT = float(np.log(1.25)), float(np.log(4.0))
-# Delays, samples, of held inputs that vary between samples.
+_EXPLAINS = float(np.log(1.25))
+"""Log of the factor by which an error of a recording must lower unmodelled accelerations."""
+_EXPLAINS_DRIFT = float(np.log(4.0))
+"""The same of a drift."""
 _CONTINUOUS = (-0.9, -0.1)
+"""Delays, samples, of held inputs that vary between samples."""
 
 
 @dataclass(frozen=True)

@@ -35,25 +35,36 @@ if TYPE_CHECKING:
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-_DEGREE, _STEPS = 4, 12
+_DEGREE = 4
+"""Of the polynomials."""
+_STEPS = 12
+"""Reweightings."""
 _SHRINK = 0.3
-_FLOOR, _VISIBLE = 1e-4, 1e-2
+"""Least factor of a scale from one reweighting to the next."""
+_FLOOR = 1e-4
+"""Least scale of residuals over the spread of a signal: polynomials are not exact."""
+_VISIBLE = 1e-2
+"""Least error of a coordinate over its spread that narrow windows, whose derivatives are noisier, are worth."""
 _AT_REST = 0.1
+"""Part of the spread of all rows below which signals are at rest in a window."""
 _TRIALS = 24
+"""Windows in which half widths are compared, of the usual one."""
 _MEDIAN = 0.31
 """Window of the running median from which smoothing starts, s."""
 _MOST_MEDIAN = 31
 """Samples of that window at most."""
-# Factor between half widths that are compared, and by which a window widens that has too few samples.
 _WIDER = 3
-# Weight of a polynomial that was fitted to fewer samples than it has coefficients.
+"""Factor between half widths that are compared, and by which a window widens that has too few samples."""
 _UNINFORMED = 1e-9
-# Samples that a window has at least, and those to either side of a knot that always suffice.
-_FEWEST, _ENOUGH_SAMPLES = 5, 25
-# Residuals that a scale is taken from; more would only cost time.
+"""Weight of a polynomial that was fitted to fewer samples than it has coefficients."""
+_FEWEST = 5
+"""Samples of a window at least."""
+_ENOUGH_SAMPLES = 25
+"""Samples to either side of a knot that always suffice."""
 _ENOUGH = 4000
-# Numbers of the windows that are fitted together at most; more would only take memory.
+"""Residuals that a scale is taken from; more would only cost time."""
 _NUMBERS_TOGETHER = 100_000
+"""Numbers of the windows that are fitted together at most; more would only take memory."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
