@@ -17,7 +17,7 @@ from diransac.data.dataset import ParameterLayout
 from diransac.data.preprocessing import differentiate
 from diransac.errors import TimeLimitError
 from diransac.identification.assessment.inspection import inspect
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.estimate import TIME_LIMIT
 from diransac.identification.methods.lo_diransac.unmeasured import measured_velocities
 from diransac.identification.regression import observers as search
@@ -477,7 +477,7 @@ def test_signals_and_sensors_measure_velocities(signals, velocities):
     model, n = dr.models.quadrotor(motor_lag=True, imu=True), 8
     known = np.tile([name in signals for name in model.signals], (n, 1))
     log = np.zeros(known.shape), known, np.zeros((n, model.n_u)), np.zeros(n, bool)
-    intervals = ShootingIntervals.of(model, ParameterLayout(model.parameters), [log], 0.01, 4, 1)
+    intervals = Windows.of(model, ParameterLayout(model.parameters), [log], 0.01, 4, 1)
     names = np.array(list(model.velocities))
     assert set(names[measured_velocities(intervals)]) == velocities
 

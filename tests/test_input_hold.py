@@ -13,7 +13,7 @@ import diransac as dr
 from command_line import run
 from diransac.data.dataset import Dataset, ParameterLayout
 from diransac.errors import SettingsError
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.diagnosis import Resolution
 from diransac.model import Model, Parameter
 from diransac.simulation import RolloutBatch, rollouts
@@ -178,7 +178,7 @@ def test_shooting_intervals_of_a_log_do_not_depend_on_the_next_log(length, hold)
 def _intervals(logs, length, hold):
     layout = ParameterLayout(PENDULUM.parameters, len(logs))
     logs = [(*log, np.zeros(len(log[-1]), bool)) for log in logs]
-    return ShootingIntervals.of(PENDULUM, layout, logs, 0.05, length, 5, hold)
+    return Windows.of(PENDULUM, layout, logs, 0.05, length, 5, hold)
 
 
 # Results -------------------------------------------------------------------------------------------------------------

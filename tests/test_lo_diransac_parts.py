@@ -16,8 +16,8 @@ from diransac.identification.core.fit import Fit, with_residuals
 from diransac.identification.core.minimise import Prior, refine_exact, refine_further
 from diransac.identification.core.noise import Mixture, lower_scale
 from diransac.identification.core.rows import solve_sets
-from diransac.identification.core.theta import ErrorKind
-from diransac.identification.core.windows import ShootingIntervals, augmented_model
+from diransac.identification.core.theta import EffectKind
+from diransac.identification.core.windows import Windows, augmented_model
 from diransac.identification.methods.lo_diransac import integration_steps
 from diransac.identification.methods.lo_diransac.hypotheses import robust_scores, weak_form
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
@@ -42,9 +42,7 @@ def intervals_over(measured, inputs, model=ROTORCRAFT, dt=0.01, length=25):
     """Intervals of one log in which everything is measured, with the default integration steps."""
     layout, known = ParameterLayout(model.parameters), np.ones(measured.shape, bool)
     substeps = dr.LoDiransac().substeps
-    return ShootingIntervals.of(
-        model, layout, [(measured, known, inputs, np.zeros(len(inputs), bool))], dt, length, substeps
-    )
+    return Windows.of(model, layout, [(measured, known, inputs, np.zeros(len(inputs), bool))], dt, length, substeps)
 
 
 def intervals_of(n_rows=200, length=25, dt=0.01):
@@ -456,7 +454,7 @@ def test_a_step_keeps_the_damping_that_it_needed_and_tells_its_information_witho
 
 def test_a_step_is_compared_with_no_step_where_fractions_of_a_sample_were_corrected_by_the_rates_of_another_fit():
     intervals, signals = intervals_of(n_rows=200)
-    late, fit = ErrorKind((0, 1, 2), "delay"), perturbed_fit(intervals, signals)
+    late, fit = EffectKind((0, 1, 2), "delay"), perturbed_fit(intervals, signals)
     other = replace(fit, x=fit.x + 0.3, shared=0.5 * fit.shared)
     intervals = intervals.corrected({late: 0.4}, signal_rates(intervals, with_residuals(intervals, other)))
     at = JointEquations.of(intervals, with_residuals(intervals, fit), (late,))
@@ -472,7 +470,7 @@ def test_a_step_is_compared_with_no_step_where_fractions_of_a_sample_were_correc
 def test_a_step_of_a_fit_and_its_errors_is_that_of_dense_algebra():
     intervals, signals = intervals_of(n_rows=200)
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
-    kinds = (intervals.all_inputs("delay"), ErrorKind((4,), "bias"), ErrorKind((2,), "delay"))
+    kinds = (intervals.all_inputs("delay"), EffectKind((4,), "bias"), EffectKind((2,), "delay"))
     at = JointEquations.of(intervals, fit, kinds)
     system, (right_z, right_s) = at.system, at.right
     n, k = right_z.size, right_z.shape[1]
@@ -497,7 +495,7 @@ def test_an_error_of_a_recording_in_the_border_is_the_schur_complement():
     """Step and information of the errors are those that follow from the fit's own system alone."""
     intervals, signals = intervals_of(n_rows=200)
     fit = with_residuals(intervals, perturbed_fit(intervals, signals))
-    at = JointEquations.of(intervals, fit, (intervals.all_inputs("delay"), ErrorKind((4,), "bias")))
+    at = JointEquations.of(intervals, fit, (intervals.all_inputs("delay"), EffectKind((4,), "bias")))
     columns, n_s = at.columns, len(fit.shared)
     z, s = at.of_fit.system.functional(columns.of_z, columns.of_s)
     left = at.system.corner[n_s:, n_s:] - np.einsum("wke,wkf->ef", columns.of_z, z) - columns.of_s.T @ s
@@ -618,7 +616,7 @@ def test_delays_that_are_withdrawn_have_no_effect_on_a_covariance():
 def test_weights_follow_their_samples_where_a_delay_passes_half_a_sample():
     """An outlier that lost its weight to its neighbour would forbid the step."""
     intervals, signals = intervals_of()
-    kind, rates = ErrorKind((2,), "delay"), np.gradient(signals, axis=0)
+    kind, rates = EffectKind((2,), "delay"), np.gradient(signals, axis=0)
     punctual, late = (intervals.corrected({kind: x}, rates) for x in (0.4, 0.6))
     weights = np.tile(np.arange(1.0, 201.0)[:, None], 9)
     assert punctual.weights_in(punctual, weights) is weights

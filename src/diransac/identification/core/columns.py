@@ -20,8 +20,8 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.identification.core.fit import Fit, with_residuals
-from diransac.identification.core.theta import ErrorKind
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.theta import EffectKind
+from diransac.identification.core.windows import Windows
 
 if TYPE_CHECKING:
     from diransac.identification.core.equations import NormalEquations
@@ -58,9 +58,7 @@ class Columns:
     of_jumps: FloatArray
 
     @classmethod
-    def of(
-        cls, intervals: ShootingIntervals, at: NormalEquations, changes: Sequence[Change], along: FloatArray
-    ) -> Columns:
+    def of(cls, intervals: Windows, at: NormalEquations, changes: Sequence[Change], along: FloatArray) -> Columns:
         """Derivatives from those of residuals and jumps, and the products ``along (W, E, 1 + n)`` of the residuals."""
         jumps = np.stack([x for _, x in changes], axis=-1) if changes else np.zeros((*at.jumps.shape, 0))
         of_z, of_s = at.by_jumps(intervals, jumps)
@@ -89,7 +87,7 @@ Change = tuple[FloatArray, FloatArray]
 """Derivatives of residuals (N, n_s) and of jumps (W - 1, n_x) with respect to an error."""
 
 
-def changes_by(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind], rates: FloatArray) -> list[Change]:
+def changes_by(intervals: Windows, fit: Fit, kinds: Sequence[EffectKind], rates: FloatArray) -> list[Change]:
     """Derivatives with respect to errors; those of inputs by the difference of simulations."""
     changes = []
     for kind in kinds:
@@ -107,7 +105,7 @@ def changes_by(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind
     return changes
 
 
-def recorrected(intervals: ShootingIntervals, fit: Fit) -> tuple[ShootingIntervals, Fit, FloatArray]:
+def recorrected(intervals: Windows, fit: Fit) -> tuple[Windows, Fit, FloatArray]:
     """Recordings whose fractions of a sample are corrected by the rates of this fit, which these are; the last result.
 
     A step is compared with no step then.
@@ -119,12 +117,12 @@ def recorrected(intervals: ShootingIntervals, fit: Fit) -> tuple[ShootingInterva
     return corrected, replace(fit, residuals=fit.residuals + intervals.measured - corrected.measured), rates
 
 
-def signal_rates(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def signal_rates(intervals: Windows, fit: Fit) -> FloatArray:
     """Change of each simulated signal per sample; none where it is a rounding error.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns

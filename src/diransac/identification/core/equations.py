@@ -36,7 +36,7 @@ from diransac.identification.core.fit import (
     with_residuals,
 )
 from diransac.identification.core.theta import (
-    ErrorKind,
+    EffectKind,
     bounded,
     in_places,
     largest_size,
@@ -46,7 +46,7 @@ from diransac.identification.core.theta import (
     sum_in_places,
     sum_of_products,
 )
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -97,12 +97,12 @@ class NormalEquations:
     rights: FloatArray
     along: FloatArray
 
-    def excess(self, intervals: ShootingIntervals, fit: Fit, moved: Fit) -> FloatArray:
+    def excess(self, intervals: Windows, fit: Fit, moved: Fit) -> FloatArray:
         """Jumps ``(W - 1, n_x)`` after a step, less those that these equations expect, from the step of a fit alone.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
         fit : Fit
             Of these equations.
         moved : Fit
@@ -114,12 +114,12 @@ class NormalEquations:
         linear = self.jumps + z[1:, :n_x] - np.einsum("wij,wj->wi", self.slopes, np.hstack([z, s])[:-1])
         return np.asarray(moved.jumps(intervals) - linear)
 
-    def by_residuals(self, intervals: ShootingIntervals, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def by_residuals(self, intervals: Windows, along: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Change of the gradient by larger residuals.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
         along : (W, 1 + n) array
             Of a change of the residuals.
 
@@ -130,12 +130,12 @@ class NormalEquations:
         k = self.right_z.shape[1]
         return along[:, 1 : 1 + k], sum_in_places(intervals, along[:, 1 + k :])
 
-    def by_jumps(self, intervals: ShootingIntervals, more: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def by_jumps(self, intervals: Windows, more: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Change of the gradient by larger jumps.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
         more : (W - 1, n_x, ...) array
             0 is taken where a log or a gap ends.
 
@@ -153,13 +153,13 @@ class NormalEquations:
 
 
 def linearize(
-    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, directions: Sequence[FloatArray] = ()
+    intervals: Windows, fit: Fit, weights: FloatArray, directions: Sequence[FloatArray] = ()
 ) -> NormalEquations:
     """Gauss-Newton normal equations of the cost at a fit.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
@@ -213,12 +213,12 @@ def linearize(
     return NormalEquations(weights, system, g[:, :k], right, data_z, data_s, *of_jumps, corners, rights, sums.along)
 
 
-def without_windows(intervals: ShootingIntervals, fit: Fit, at: NormalEquations) -> tuple[FloatArray, FloatArray]:
+def without_windows(intervals: Windows, fit: Fit, at: NormalEquations) -> tuple[FloatArray, FloatArray]:
     """Normal equations of the shared unknowns, the right-hand side last, when windows that nothing ties are eliminated.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     at : NormalEquations
 
@@ -241,13 +241,13 @@ def without_windows(intervals: ShootingIntervals, fit: Fit, at: NormalEquations)
 
 
 def variances_of_intervals(
-    intervals: ShootingIntervals, fit: Fit, weights: FloatArray, z: FloatArray, s: FloatArray
+    intervals: Windows, fit: Fit, weights: FloatArray, z: FloatArray, s: FloatArray
 ) -> FloatArray:
     """Variances of functions of a fit by the noise of each interval's measurements alone, of inputs if they are noisy.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over the variance of each.
@@ -267,12 +267,12 @@ def variances_of_intervals(
     return np.asarray(found)
 
 
-def cost(intervals: ShootingIntervals, fit: Fit, weights: FloatArray) -> float:
+def cost(intervals: Windows, fit: Fit, weights: FloatArray) -> float:
     """Twice the cost of a fit with fixed weights.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     weights : (N, n_signals) array
         Weights of the measurements, one over each signal's unit squared.
@@ -303,13 +303,13 @@ class JointEquations:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         Recordings are corrected by the rates of this fit.
     fit : Fit
         Where they are linearised, with its residuals.
     of_fit : NormalEquations
         Of the fit alone.
-    kinds : tuple of ErrorKind
+    kinds : tuple of EffectKind
     rates : (N, n_s) or (1, n_s) array
         Change of each signal per sample; 0 where no error is one of signals.
     columns : Columns
@@ -318,10 +318,10 @@ class JointEquations:
         Minus the gradient: of intervals, and of shared unknowns and errors.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     fit: Fit
     of_fit: NormalEquations
-    kinds: tuple[ErrorKind, ...]
+    kinds: tuple[EffectKind, ...]
     rates: FloatArray
     columns: Columns
     system: Arrowhead
@@ -329,15 +329,15 @@ class JointEquations:
 
     @classmethod
     def of(
-        cls, intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind], weights: FloatArray | None = None
+        cls, intervals: Windows, fit: Fit, kinds: Sequence[EffectKind], weights: FloatArray | None = None
     ) -> JointEquations:
         """Equations at a fit.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
         fit : Fit
-        kinds : sequence of ErrorKind
+        kinds : sequence of EffectKind
         weights : (N, n_s) array, optional
             Of the measurements; None: those of the fit, as `weights_of`.
         """
@@ -384,7 +384,7 @@ class JointEquations:
         step = self.solve()
         return step.log_det + float(np.linalg.slogdet(self.errors_of(step)[2])[1]) if self.kinds else step.log_det
 
-    def moved(self, step: Factored) -> tuple[ShootingIntervals, Fit]:
+    def moved(self, step: Factored) -> tuple[Windows, Fit]:
         """Recordings and fit after a step within the bounds of all shared unknowns.
 
         Parameters
@@ -401,14 +401,14 @@ class JointEquations:
         moved = replace(fit, shared=shared, x=fit.x + z[:, :n_x], d=fit.d + z[:, n_x:])
         return intervals, with_residuals(intervals, moved)
 
-    def _bounded(self, kind: ErrorKind, more: float) -> float:
+    def _bounded(self, kind: EffectKind, more: float) -> float:
         """Change of an error that leaves it possible; a time constant at most halves."""
         now, largest = self.intervals.all_errors.sizes[kind], largest_size(self.intervals, kind)
         if kind.what == "lag":
             more = max(more, -0.5 * float(self.intervals.all_errors.input_lag[list(kind.columns)].min()))
         return float(np.clip(now + more, -largest, largest)) - now
 
-    def corrected(self, intervals: ShootingIntervals, moved: Fit) -> Right:
+    def corrected(self, intervals: Windows, moved: Fit) -> Right:
         """Right-hand sides of a step that makes up for the curvature of the rollouts along another step.
 
         Where continuity is tight, ends that are curved fill the cost of a step that is right otherwise, and no step but
@@ -416,7 +416,7 @@ class JointEquations:
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
         moved : Fit
             After the other step, with its recordings.
 
@@ -434,7 +434,7 @@ class JointEquations:
         return self.right[0] - of_z, self.right[1] - np.concatenate([of_s, of_e])
 
 
-def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> JointEquations:
+def linearized(intervals: Windows, fit: Fit, weights: FloatArray | None = None) -> JointEquations:
     """Equations at a fit and the errors of its recordings; arguments as of `JointEquations.of`.
 
     Errors of noisy inputs stay as they are: a delay by a fraction of a sample, or a lag, would average their noise.
@@ -443,12 +443,12 @@ def linearized(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | Non
     return JointEquations.of(intervals, fit, kinds, weights)
 
 
-def effect_on(intervals: ShootingIntervals, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:
+def effect_on(intervals: Windows, fit: Fit, z: FloatArray, s: FloatArray) -> FloatArray:
     """Covariance of functions of a fit by the uncertainty of the errors of its recordings.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum.
     z, s : (W, k, n) and (n_s, n) array

@@ -15,7 +15,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.core.boundary import BoundaryPrior
 from diransac.identification.core.noise import Mixture
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 
 if TYPE_CHECKING:
     pass
@@ -76,17 +76,17 @@ class Fit:
         """State and unmodelled accelerations at the start, and the shared unknowns, as one vector ``(n,)``."""
         return np.concatenate([self.x[0], self.d[0], self.shared])
 
-    def jumps(self, intervals: ShootingIntervals) -> FloatArray:
+    def jumps(self, intervals: Windows) -> FloatArray:
         """States at the intervals' starts less the ends of the intervals before, (W - 1, n_x); 0 where unlinked."""
         return np.where(intervals.linked[:, None], self.x[1:] - self.ends[:-1], 0.0)
 
 
-def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
+def with_residuals(intervals: Windows, fit: Fit) -> Fit:
     """The fit with its residuals and ends over the given intervals.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -97,19 +97,19 @@ def with_residuals(intervals: ShootingIntervals, fit: Fit) -> Fit:
     return replace(fit, residuals=residuals, ends=ends)
 
 
-def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingIntervals, Fit]:
+def split(intervals: Windows, fit: Fit, parts: int) -> tuple[Windows, Fit]:
     """The same motion in shorter intervals, whose unmodelled accelerations vary as much, and as slowly.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     parts : int
         Of each interval.
 
     Returns
     -------
-    ShootingIntervals, Fit
+    Windows, Fit
     """
     # The sum of correlations over time, (1 + rho) / (1 - rho) intervals, stays.
     slow = parts * (1.0 + fit.rho)
@@ -122,12 +122,12 @@ def split(intervals: ShootingIntervals, fit: Fit, parts: int) -> tuple[ShootingI
     return finer, with_residuals(finer, replace(fit, x=x, d=np.repeat(fit.d, parts, axis=0)))
 
 
-def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def innovation_std(intervals: Windows, fit: Fit) -> FloatArray:
     """Standard deviation ``(W, n_v)`` of the unmodelled accelerations, given those of the interval before.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -141,12 +141,12 @@ def innovation_std(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return std
 
 
-def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def innovations(intervals: Windows, fit: Fit) -> FloatArray:
     """Unmodelled accelerations less those expected from the interval before, over their standard deviation.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -158,12 +158,12 @@ def innovations(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.asarray(found / innovation_std(intervals, fit))
 
 
-def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def weights_of(intervals: Windows, fit: Fit) -> FloatArray:
     """Weight of each measurement: the probability that it is not an outlier, over its variance.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -175,12 +175,12 @@ def weights_of(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return found
 
 
-def innovation_terms(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
+def innovation_terms(intervals: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Terms of the innovations in the normal equations: diagonals of D and E, and right-hand side.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns

@@ -37,7 +37,7 @@ from diransac.identification.core.scales import (
     process_sums,
     unbroken_jumps,
 )
-from diransac.identification.core.windows import DIVERGED, ShootingIntervals
+from diransac.identification.core.windows import DIVERGED, Windows
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Step:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         After the step.
     at : JointEquations
@@ -93,7 +93,7 @@ class Step:
         Of the next step.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     fit: Fit
     at: JointEquations
     taken: Factored | None
@@ -176,7 +176,7 @@ class Refinement:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         With the most probable errors of the recordings.
     fit : Fit
         Most probable motion and parameters.
@@ -188,20 +188,20 @@ class Refinement:
         Whether the steps ended before the limit.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     fit: Fit
     cost: float
     steps: int
     converged: bool
 
 
-def make_prior(settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, unit: FloatArray) -> Prior:
+def make_prior(settings: LoDiransacSettings, intervals: Windows, motion: Motion, unit: FloatArray) -> Prior:
     """Prior in the units of the logs.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
     unit : (n_s,) array
         Result of `discrepancy_units`.
@@ -224,15 +224,13 @@ def _accelerations(model: Model, motion: Motion) -> FloatArray:
     return motion.spread[n_x : n_x + model.n_v]
 
 
-def start(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, p: FloatArray, prior: Prior
-) -> Fit:
+def start(settings: LoDiransacSettings, intervals: Windows, motion: Motion, p: FloatArray, prior: Prior) -> Fit:
     """Initial fit from a hypothesis and the smoothed motion at the intervals' starts, or their neighbours' ends.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     p : (n,) array
@@ -263,7 +261,7 @@ def start(
     return _anchored(intervals, fit)
 
 
-def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
+def _anchored(intervals: Windows, fit: Fit) -> Fit:
     """The fit with initial states propagated from neighbouring intervals, where they have a higher likelihood.
 
     Where outliers are in the majority for longer than an interval, its state follows from its neighbours alone.
@@ -286,7 +284,7 @@ def _anchored(intervals: ShootingIntervals, fit: Fit) -> Fit:
 
 
 def _better(
-    intervals: ShootingIntervals, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
+    intervals: Windows, fit: Fit, losses: FloatArray, chosen: IntArray, states: FloatArray
 ) -> tuple[Fit, FloatArray, BoolArray]:
     """The fit with other initial states of chosen intervals where they have a higher likelihood, and its losses.
 
@@ -310,7 +308,7 @@ def _better(
 
 
 def _losses(
-    intervals: ShootingIntervals, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
+    intervals: Windows, noise: Mixture, residuals: FloatArray, ends: FloatArray, chosen: IntArray
 ) -> FloatArray:
     """Negative log-likelihood ``(n,)`` of the samples of chosen intervals; infinite where a rollout diverges."""
     known = intervals.known if len(chosen) == len(intervals) else intervals.known[intervals.rows_of(chosen)]
@@ -344,14 +342,12 @@ class Schedule(Protocol):
         ...
 
 
-def minimise(
-    intervals: ShootingIntervals, fit: Fit, schedule: Schedule, limit: int, rival: float = np.inf
-) -> Refinement:
+def minimise(intervals: Windows, fit: Fit, schedule: Schedule, limit: int, rival: float = np.inf) -> Refinement:
     """The fit after Gauss-Newton steps, with an update of every scale after each, until convergence.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         Their errors of recordings are estimated, too.
     fit : Fit
         Initial fit, as from `start`.
@@ -430,7 +426,7 @@ class Exact:
     settled = 0.01
 
     @classmethod
-    def of(cls, settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Exact:
+    def of(cls, settings: LoDiransacSettings, intervals: Windows, fit: Fit, prior: Prior) -> Exact:
         """Schedule from a fit: jumps become negligible beside the uncertainty of its states."""
         at = linearized(intervals, fit)
         unbroken = unbroken_jumps(fit, at.solve())
@@ -462,12 +458,12 @@ class SegmentsApart:
         return replace(fit, noise=noise)
 
 
-def refine(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine(settings: LoDiransacSettings, intervals: Windows, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model with discrepancies, whose sizes are those of the largest evidence; errors as `minimise`."""
     return minimise(intervals, fit, Flexible(settings, prior), settings.max_steps)
 
 
-def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine_exact(settings: LoDiransacSettings, intervals: Windows, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the model as it is, from one with discrepancies, as from `refine`; errors as `minimise`."""
     shared, sizes, tau = fit.shared.copy(), fit.prior.copy(), _NEARLY_EXACT * prior.tau
     shared[intervals.n_p :], sizes[intervals.n_p :] = 0.0, _OFF * prior.unit[intervals.n_p :]
@@ -476,7 +472,7 @@ def refine_exact(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     return minimise(intervals, fit, Exact.of(settings, intervals, fit, prior), settings.max_steps)
 
 
-def refine_further(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit) -> Refinement:
+def refine_further(settings: LoDiransacSettings, intervals: Windows, fit: Fit) -> Refinement:
     """Fit of the model as it is, from one as of `refine_exact`, whose scales stay as tight; errors as `minimise`."""
     return minimise(intervals, fit, Exact(settings, fit.tau, fit.continuity_std), settings.max_steps)
 
@@ -488,7 +484,7 @@ def _evidence(at: JointEquations) -> float:
     return negative_log_evidence(at.intervals, at.fit, at.log_det)
 
 
-def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float) -> float:
+def negative_log_evidence(intervals: Windows, fit: Fit, log_det: float) -> float:
     """Negative logarithm of the probability of the measurements by Laplace's method.
 
     Up to a constant that fits of the same log have in common, given the scales of a fit at its optimum.  Freedom costs:
@@ -496,7 +492,7 @@ def negative_log_evidence(intervals: ShootingIntervals, fit: Fit, log_det: float
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     log_det : float
         Of its normal equations.

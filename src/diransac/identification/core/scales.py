@@ -17,7 +17,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.identification.core.arrowhead import Factored
 from diransac.identification.core.fit import Fit, innovation_std, innovations
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 
 SHRINK = 0.4
 """Largest change of any scale in a step."""
@@ -109,12 +109,12 @@ class ProcessSums:
         return np.asarray((self.product / (self.size + np.square(expected))).clip(0.0, _MOST_ALIKE))
 
 
-def process_sums(intervals: ShootingIntervals, fit: Fit, solved: Factored) -> ProcessSums:
+def process_sums(intervals: Windows, fit: Fit, solved: Factored) -> ProcessSums:
     """Sums of each interval.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     solved : Factored
         Of the normal equations at the fit, or one step before.
@@ -172,12 +172,12 @@ def most_probable_size(
     return np.asarray(np.clip(size, SHRINK * now, now / SHRINK))
 
 
-def negligible_jumps(intervals: ShootingIntervals, tau: FloatArray) -> FloatArray:
+def negligible_jumps(intervals: Windows, tau: FloatArray) -> FloatArray:
     """Jumps ``(n_x,)`` that are negligible beside the effect of unmodelled accelerations on the state.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     tau : (n_v,) array
         Size of the unmodelled accelerations.
 
@@ -188,12 +188,12 @@ def negligible_jumps(intervals: ShootingIntervals, tau: FloatArray) -> FloatArra
     return CONTINUITY * effect_on_state(intervals, tau)
 
 
-def effect_on_state(intervals: ShootingIntervals, acceleration: FloatArray) -> FloatArray:
+def effect_on_state(intervals: Windows, acceleration: FloatArray) -> FloatArray:
     """Size of the change ``(n_x,)`` of the state by accelerations ``(n_v,)`` over an interval.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     acceleration : (n_v,) array
 
     Returns

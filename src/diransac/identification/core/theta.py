@@ -16,14 +16,14 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 _LATEST = 0.1
 """Largest delay or lag, over the duration of the longest log."""
 
 
 @dataclass(frozen=True)
-class ErrorKind:
+class EffectKind:
     """Kind of error of a recording, of one signal or input, or of a group alike.
 
     Parameters
@@ -42,7 +42,7 @@ class ErrorKind:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RecordingErrors:
+class Effects:
     """Systematic errors of the sensors and of the inputs, and what the sensors measured.
 
     Parameters
@@ -51,17 +51,17 @@ class RecordingErrors:
     sampled : (N, n_s) bool array
         As recorded.
     n_inputs : int
-    sizes : mapping from ErrorKind to float, optional
+    sizes : mapping from EffectKind to float, optional
         Errors that are estimated; those of one signal or input add.
     """
 
     measured: FloatArray
     sampled: BoolArray
     n_inputs: int
-    sizes: Mapping[ErrorKind, float] = field(default_factory=dict)
+    sizes: Mapping[EffectKind, float] = field(default_factory=dict)
 
     @property
-    def kinds(self) -> tuple[ErrorKind, ...]:
+    def kinds(self) -> tuple[EffectKind, ...]:
         """Errors that are estimated."""
         return tuple(self.sizes)
 
@@ -97,33 +97,33 @@ class RecordingErrors:
                 found[list(kind.columns)] += size
         return found
 
-    def plus(self, more: Mapping[ErrorKind, float]) -> RecordingErrors:
+    def plus(self, more: Mapping[EffectKind, float]) -> Effects:
         """These errors and others.
 
         Parameters
         ----------
-        more : mapping from ErrorKind to float
+        more : mapping from EffectKind to float
 
         Returns
         -------
-        RecordingErrors
+        Effects
         """
         sizes = {**self.sizes, **{kind: self.sizes.get(kind, 0.0) + x for kind, x in more.items()}}
         return replace(self, sizes=sizes)
 
 
-def places(intervals: ShootingIntervals) -> IntArray:
+def places(intervals: Windows) -> IntArray:
     """Places of the shared unknowns of each log, (n_logs, n)."""
     rest = np.arange(intervals.n_p, intervals.n_shared)
     return np.hstack([intervals.layout.index, np.broadcast_to(rest, (intervals.layout.n_logs, len(rest)))])
 
 
-def of_logs(intervals: ShootingIntervals, values: FloatArray, part: slice = slice(None)) -> FloatArray:
+def of_logs(intervals: Windows, values: FloatArray, part: slice = slice(None)) -> FloatArray:
     """Values of the shared unknowns of each interval's own log.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     values : (n_s, ...) array
     part : slice, optional
         Intervals; all where none are given.
@@ -138,7 +138,7 @@ def of_logs(intervals: ShootingIntervals, values: FloatArray, part: slice = slic
     return np.asarray(values[places(intervals)[logs]])
 
 
-def in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+def in_places(intervals: Windows, values: FloatArray) -> FloatArray:
     """Values ``(n, ...)`` of the first intervals' own shared unknowns in the places of their logs, (n, n_s)."""
     if intervals.layout.is_shared:
         return values.copy()
@@ -147,14 +147,12 @@ def in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
     return wide
 
 
-def sum_of_products(
-    intervals: ShootingIntervals, a: FloatArray, b: FloatArray, part: slice = slice(None)
-) -> FloatArray:
+def sum_of_products(intervals: Windows, a: FloatArray, b: FloatArray, part: slice = slice(None)) -> FloatArray:
     """Sums ``(n_s, ...)`` over intervals of ``a @ b``, in the places of their logs.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     a : (n, n_own, m) array
         Of the shared unknowns of the first intervals' own logs.
     b : (n, m, ...) array
@@ -169,12 +167,12 @@ def sum_of_products(
     return found
 
 
-def sum_in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+def sum_in_places(intervals: Windows, values: FloatArray) -> FloatArray:
     """Sums over intervals, in the places of their logs.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     values : (n, n_own, ...) array
         Of the shared unknowns of the first intervals' own logs.
 
@@ -191,7 +189,7 @@ def sum_in_places(intervals: ShootingIntervals, values: FloatArray) -> FloatArra
 
 
 def shared_blocks(
-    intervals: ShootingIntervals, border: FloatArray, corner: FloatArray, right: FloatArray
+    intervals: Windows, border: FloatArray, corner: FloatArray, right: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Border ``(W, k, n_s)``, sums of corner ``(n_s, n_s)`` and right side ``(n_s,)`` in the places of each log."""
     if intervals.layout.is_shared:
@@ -206,13 +204,13 @@ def shared_blocks(
     return wide, whole, total
 
 
-def largest_size(intervals: ShootingIntervals, kind: ErrorKind) -> float:
+def largest_size(intervals: Windows, kind: EffectKind) -> float:
     """Largest size of an error, and its prior standard deviation: a tenth of the log, a signal's range, all of a gain.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
-    kind : ErrorKind
+    intervals : Windows
+    kind : EffectKind
     """
     if kind.what == "bias":
         columns = list(kind.columns)
@@ -221,14 +219,14 @@ def largest_size(intervals: ShootingIntervals, kind: ErrorKind) -> float:
     return 1.0 if kind.what == "drift" else _LATEST * max(x.stop - x.start for x in intervals.rows_of_logs)
 
 
-def is_possible(intervals: ShootingIntervals, kind: ErrorKind, more: float) -> bool:
+def is_possible(intervals: Windows, kind: EffectKind, more: float) -> bool:
     """True if an error that is larger by some amount stays below the largest one, and time constants positive."""
     size = intervals.all_errors.sizes.get(kind, 0.0) + more
     lags = intervals.all_errors.input_lag[list(kind.columns)] if kind.what == "lag" else np.ones(1)
     return bool(abs(size) < largest_size(intervals, kind) and (kind.what != "lag" or (lags + more > 0.0).all()))
 
 
-def bounded(intervals: ShootingIntervals, now: FloatArray, then: FloatArray) -> FloatArray:
+def bounded(intervals: Windows, now: FloatArray, then: FloatArray) -> FloatArray:
     """Shared unknowns ``(n_s,)``, parameters within their bounds; a positive one at most halves or doubles."""
     then = then.copy()
     for j, bounds in enumerate(intervals.layout.bounds):

@@ -29,7 +29,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.input_timing import acting_inputs
-from diransac.identification.core.theta import ErrorKind, RecordingErrors
+from diransac.identification.core.theta import EffectKind, Effects
 from diransac.model import Model, Parameter
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
@@ -52,7 +52,7 @@ _WORTH_THREADS = 4e6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ShootingIntervals:
+class Windows:
     """Rows of all logs as intervals of ``length`` rows; made by `of`, which pads the last interval of each log.
 
     Parameters
@@ -82,7 +82,7 @@ class ShootingIntervals:
     hold : str, optional
         Inputs from row to row, one of `HOLDS`.  Only the state after the last row of a log, which nothing
         uses, depends on the inputs of the next log.
-    errors : RecordingErrors, optional
+    errors : Effects, optional
         Errors of which ``measured`` is corrected, and with which the inputs act.
     threads : int, optional
         Threads of the simulations with derivatives.
@@ -107,7 +107,7 @@ class ShootingIntervals:
     length: int
     substeps: int
     hold: str = "zero-order"
-    errors: RecordingErrors | None = None
+    errors: Effects | None = None
     threads: int = 1
     discrepancies: bool = True
     noisy: bool = False
@@ -123,7 +123,7 @@ class ShootingIntervals:
         length: int,
         substeps: int,
         hold: str = "zero-order",
-    ) -> ShootingIntervals:
+    ) -> Windows:
         """Intervals of logs of any length.
 
         Parameters
@@ -143,7 +143,7 @@ class ShootingIntervals:
 
         Returns
         -------
-        ShootingIntervals
+        Windows
         """
         sizes = [len(log[2]) for log in logs]
         missing = [-n % length for n in sizes]
@@ -254,9 +254,9 @@ class ShootingIntervals:
         """Change ``(N, n_u)`` of the acting inputs per sample of delay."""
         return np.concatenate([_differences(-self.inputs[rows]) for rows in self.rows_of_logs])
 
-    def all_inputs(self, what: Literal["delay", "bias", "lag", "drift"]) -> ErrorKind:
+    def all_inputs(self, what: Literal["delay", "bias", "lag", "drift"]) -> EffectKind:
         """An error that all inputs that move have in common."""
-        return ErrorKind(tuple(np.flatnonzero(np.ptp(self.recorded, axis=0) > 0.0).tolist()), what, of_inputs=True)
+        return EffectKind(tuple(np.flatnonzero(np.ptp(self.recorded, axis=0) > 0.0).tolist()), what, of_inputs=True)
 
     @cached_property
     def rows_of_logs(self) -> list[slice]:
@@ -265,25 +265,25 @@ class ShootingIntervals:
         return [slice(a, b) for a, b in pairwise(edges)]
 
     @property
-    def all_errors(self) -> RecordingErrors:
+    def all_errors(self) -> Effects:
         """Errors of the recordings, none of which may be known."""
         if self.errors is not None:
             return self.errors
-        return RecordingErrors(self.measured, self.sampled, self.recorded.shape[1])
+        return Effects(self.measured, self.sampled, self.recorded.shape[1])
 
-    def corrected(self, more: Mapping[ErrorKind, float], rates: FloatArray) -> ShootingIntervals:
+    def corrected(self, more: Mapping[EffectKind, float], rates: FloatArray) -> Windows:
         """The intervals with recordings that are corrected of further errors.
 
         Parameters
         ----------
-        more : mapping from ErrorKind to float
+        more : mapping from EffectKind to float
             By how much larger they are.
         rates : (N, n_s) array
             Change of each signal per sample, for the fractions of a sample.
 
         Returns
         -------
-        ShootingIntervals
+        Windows
         """
         errors = self.all_errors.plus(more)
         whole, measured, sampled = np.round(errors.delay), errors.measured, errors.sampled
@@ -294,7 +294,7 @@ class ShootingIntervals:
         measured = measured + (errors.delay - whole) * rates - errors.bias
         return replace(self, measured=np.where(sampled, measured, 0.0), sampled=sampled, errors=errors)
 
-    def weights_in(self, other: ShootingIntervals, weights: FloatArray) -> FloatArray:
+    def weights_in(self, other: Windows, weights: FloatArray) -> FloatArray:
         """Weights ``(N, n_s)`` of the samples in the rows that they have in other intervals, with other delays."""
         later = np.round(other.all_errors.delay) - np.round(self.all_errors.delay)
         if not later.any():
@@ -309,31 +309,31 @@ class ShootingIntervals:
         at = np.clip(later, 0, last)
         return np.where((at == later) & (self.log_of_row[at] == own), at, -1)
 
-    def with_input_error(self, kind: ErrorKind, size: float) -> ShootingIntervals:
+    def with_input_error(self, kind: EffectKind, size: float) -> Windows:
         """The intervals with another error of an input, and measurements as they are.
 
         Parameters
         ----------
-        kind : ErrorKind
+        kind : EffectKind
         size : float
 
         Returns
         -------
-        ShootingIntervals
+        Windows
         """
         return replace(self, errors=self.all_errors.plus({kind: size}))
 
-    def with_errors(self, kinds: Iterable[ErrorKind]) -> ShootingIntervals:
+    def with_errors(self, kinds: Iterable[EffectKind]) -> Windows:
         """The intervals with further errors of the recordings, none of a size yet; lags, which have a sign, of one."""
         begin = {kind: SHORTEST_LAG if kind.what == "lag" else 0.0 for kind in kinds}
         return replace(self, errors=self.all_errors.plus(begin))
 
-    def without_error(self, kind: ErrorKind) -> ShootingIntervals:
+    def without_error(self, kind: EffectKind) -> Windows:
         """The intervals without an error of an input."""
         errors = self.all_errors
         return replace(self, errors=replace(errors, sizes={x: size for x, size in errors.sizes.items() if x != kind}))
 
-    def parts_apart(self, acting: FloatArray, hold: str, starts: IntArray, length: int) -> ShootingIntervals:
+    def parts_apart(self, acting: FloatArray, hold: str, starts: IntArray, length: int) -> Windows:
         """Parts of the logs as intervals that nothing ties.
 
         Parameters
@@ -354,11 +354,11 @@ class ShootingIntervals:
             length=length, hold=hold, apart=True, discrepancies=False, noisy=False,
         )  # fmt: skip
 
-    def split(self, parts: int) -> ShootingIntervals:
+    def split(self, parts: int) -> Windows:
         """The same rows in intervals of a fraction of the length."""
         return replace(self, length=self.length // parts, log_of=np.repeat(self.log_of, parts))
 
-    def of_log(self, log: int, layout: ParameterLayout) -> ShootingIntervals:
+    def of_log(self, log: int, layout: ParameterLayout) -> Windows:
         """The intervals of one of the logs, whose parameters are those of a layout of one log."""
         chosen, errors = self.log_of == log, self.all_errors
         rows = self.rows_of_logs[log]

@@ -28,7 +28,7 @@ _MOST_ROWS = 200_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Windows:
+class PredictedWindows:
     """Windows of n samples, and predictions of them that need no model.
 
     Parameters
@@ -218,7 +218,7 @@ class OpenLoop:
         found = self.states[rows]
         return found, np.zeros((*found.shape, found.shape[1]))
 
-    def windows(self, horizon: float) -> Iterator[Windows]:
+    def windows(self, horizon: float) -> Iterator[PredictedWindows]:
         """Windows of one horizon, one after another, from complete states; those of each stretch that has some."""
         for stretch in self.stretches:
             steps = self._steps(stretch, horizon)
@@ -230,9 +230,9 @@ class OpenLoop:
                 measured, (states, deviations) = self.segment.measured[after], self.starts(rows)
                 regular = np.isfinite(measured) & ~self.outliers[after]
                 trivial = self._trivial(states, rows, steps) - measured
-                yield Windows(rows, states, deviations, measured, regular, trivial)
+                yield PredictedWindows(rows, states, deviations, measured, regular, trivial)
 
-    def errors(self, windows: Windows, parameters: FloatArray | None = None) -> FloatArray:
+    def errors(self, windows: PredictedWindows, parameters: FloatArray | None = None) -> FloatArray:
         """Predicted less measured signals ``(K, n, n_s)``, of the loop's parameters or of others ``(n_p,)``."""
         p = self.parameters if parameters is None else parameters
         return self._simulated_errors(p, windows.states, windows.rows, windows.measured.shape[1])
@@ -280,7 +280,7 @@ class OpenLoop:
         spread = _squares_about_mean(np.concatenate(measured))
         return Sums(int(numbers[0]), int(numbers[1]), n_known, squared, spread, *others)
 
-    def _effects(self, windows: Windows, errors: FloatArray) -> FloatArray:
+    def _effects(self, windows: PredictedWindows, errors: FloatArray) -> FloatArray:
         """Root mean square effects ``(2, K, n, n_s)`` of uncertain starts, and of parameters changed by 1 %."""
         n_x = windows.states.shape[1]
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (4, n_x + len(self.parameters)))

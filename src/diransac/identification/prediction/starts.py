@@ -24,7 +24,7 @@ from diransac.data.dataset import Dataset
 from diransac.data.segment import Segment
 from diransac.errors import LogError
 from diransac.identification.core.noise import lower_scale
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.diagnosis import Resolution
 from diransac.identification.methods.lo_diransac.method import LoDiransac
 from diransac.identification.methods.lo_diransac.preparation import prepared
@@ -46,14 +46,14 @@ class SmoothedLog:
         over few samples follows their noise: then about the line between neighbours, which adds its curvature.
     outliers : (N, n_s) bool array
         Samples of the dataset's signals that are far from the motion.
-    intervals : ShootingIntervals or None
+    intervals : Windows or None
         The log in shooting intervals, of a model with equations.
     """
 
     signals: FloatArray
     noise: FloatArray
     outliers: BoolArray
-    intervals: ShootingIntervals | None = None
+    intervals: Windows | None = None
 
 
 def smoothed_log(dataset: Dataset) -> SmoothedLog | None:
@@ -129,7 +129,7 @@ class StartEstimator:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         The log.
     acting : ActingInputs
     parameters : (n_p,) array
@@ -149,7 +149,7 @@ class StartEstimator:
         Rows before a state whose samples determine it.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     acting: ActingInputs
     parameters: FloatArray
     states: FloatArray

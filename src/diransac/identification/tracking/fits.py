@@ -23,7 +23,7 @@ from diransac.identification.core.minimise import gauss_newton_step, negative_lo
 if TYPE_CHECKING:
     from diransac.identification.core.equations import JointEquations
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 _GUST = 0.9
 """Correlation from interval to interval of unmodelled accelerations that are larger than usual."""
@@ -63,12 +63,12 @@ def part(fit: Fit, first: int, end: int | None = None) -> Fit:
     return replace(fit, tau=tau, residuals=fit.residuals[chosen.start * n_rows : chosen.stop * n_rows], **motion)
 
 
-def followed(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, float]:
+def followed(intervals: Windows, fit: Fit) -> tuple[Fit, float]:
     """A fit after some steps, with noise as large as the residuals of each at first: none starts as an outlier.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -93,14 +93,14 @@ def followed(intervals: ShootingIntervals, fit: Fit) -> tuple[Fit, float]:
     return fit, -negative_log_evidence(intervals, fit, step.solved.log_det)
 
 
-def free_motion(intervals: ShootingIntervals, fit: Fit, largest: FloatArray) -> Fit:
+def free_motion(intervals: Windows, fit: Fit, largest: FloatArray) -> Fit:
     """Fit that follows the samples, whatever the parameters, with unmodelled accelerations ``(n_v,)`` of some size."""
     held = 1e-6 * (np.abs(fit.shared) + 1e-6)
     free = replace(fit, tau=largest, rho=np.zeros_like(fit.rho), prior=held, prior_mean=fit.shared, boundary=None)
     return followed(intervals, free)[0]
 
 
-def is_surprised(intervals: ShootingIntervals, fit: Fit) -> bool:
+def is_surprised(intervals: Windows, fit: Fit) -> bool:
     """True if intervals have more outliers than chance gives them: by four deviations."""
     known = intervals.known
     n_outliers = (known - fit.noise.inlying(fit.residuals, known)).sum()
@@ -108,12 +108,12 @@ def is_surprised(intervals: ShootingIntervals, fit: Fit) -> bool:
     return bool(n_outliers > expected + 4.0 * np.sqrt(variance + 1.0))
 
 
-def left_by(intervals: ShootingIntervals, fit: Fit, weights: FloatArray | None = None) -> BoundaryPrior:
+def left_by(intervals: Windows, fit: Fit, weights: FloatArray | None = None) -> BoundaryPrior:
     """What all intervals but the last tell of the unknowns where that begins, linearised at a fit.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         All with the same parameters.
     fit : Fit
     weights : (N, n_signals) array, optional

@@ -17,7 +17,7 @@ from diransac.errors import DiransacError
 from diransac.identification.core.boundary import BoundaryPrior
 from diransac.identification.core.fit import with_residuals
 from diransac.identification.core.minimise import make_prior, refine, start
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.identify import identify
 from diransac.identification.methods.lo_diransac import LoDiransac
 from diransac.identification.methods.lo_diransac.integration_steps import with_fewest_steps
@@ -61,7 +61,7 @@ class Setup:
     settings: LoDiransacSettings = field(default_factory=LoDiransacSettings)
     exact: bool = False
 
-    def intervals(self, stream: Stream, first: int, n: int) -> ShootingIntervals:
+    def intervals(self, stream: Stream, first: int, n: int) -> Windows:
         """Intervals of a stream.
 
         Parameters
@@ -74,7 +74,7 @@ class Setup:
 
         Returns
         -------
-        ShootingIntervals
+        Windows
         """
         length = stream.length // stream.parts
         held, n_s = stream.values[: first - stream.first + n * length], len(self.model.signals)
@@ -82,7 +82,7 @@ class Setup:
         measured, recorded = held[rows, :n_s], held[:, n_s:]
         known, missing = np.isfinite(measured), np.asarray(np.isnan(recorded).any(axis=1))
         acting = self.timing.acting(interpolated(recorded), stream.dt, self.hold)[rows]
-        return ShootingIntervals(
+        return Windows(
             model=self.model,
             layout=self.layout,
             measured=np.where(known, measured, 0.0),

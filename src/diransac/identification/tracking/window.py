@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from diransac.identification.core.equations import JointEquations
     from diransac.identification.core.fit import Fit
     from diransac.identification.core.minimise import Step
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.tracking.starting import Setup
     from diransac.identification.tracking.stream import Stream
 
@@ -141,7 +141,7 @@ class Window:
         """
         return np.where(self._measured, self.spread, self.expected)
 
-    def intervals(self, first: int = 0, end: int | None = None) -> ShootingIntervals:
+    def intervals(self, first: int = 0, end: int | None = None) -> Windows:
         """The intervals, or some of them, with their rows as they are now."""
         n = (len(self) if end is None else end) - first
         return self.setup.intervals(self.stream, self.first + first * self.length, n)
@@ -234,7 +234,7 @@ class Window:
         self._n_hopeless = self._n_hopeless + 1 if self._explains_nothing(intervals) else 0
         return steps[0].at
 
-    def _weights(self, intervals: ShootingIntervals) -> FloatArray | None:
+    def _weights(self, intervals: Windows) -> FloatArray | None:
         """Weights of the samples where those of the fit are a surprise: in the last second, of a free motion."""
         recent = max(len(self) - 2, 0)
         if not is_surprised(self.intervals(recent), part(self.fit, recent)):
@@ -249,13 +249,13 @@ class Window:
         """True if the fit has explained nothing in as many steps as the window has intervals."""
         return self._n_hopeless >= self.most
 
-    def _follow_spread(self, intervals: ShootingIntervals) -> None:
+    def _follow_spread(self, intervals: Windows) -> None:
         """Raise the spread of the signals to that of the fitted motion, with a delay of a window."""
         now = (self.fit.residuals + intervals.measured).std(axis=0)
         share = 1.0 / self.most
         self._spread = self._spread * np.clip(now / self._spread, 1.0, 1.0 / SHRINK) ** share
 
-    def _explains_nothing(self, intervals: ShootingIntervals) -> bool:
+    def _explains_nothing(self, intervals: Windows) -> bool:
         """True if noise or unmodelled accelerations are as large as the signals themselves."""
         seen = intervals.known.any(axis=0)
         noise = self.fit.noise
@@ -263,7 +263,7 @@ class Window:
         nothing = ((noise.sigma > 0.8 * self._spread) | (noise.pi > 0.8))[seen].all()
         return bool(nothing or (self.fit.tau > self.spread)[self._measured].all())
 
-    def _with_scales(self, intervals: ShootingIntervals, fit: Fit, solved: Factored) -> Fit:
+    def _with_scales(self, intervals: Windows, fit: Fit, solved: Factored) -> Fit:
         """The fit with its scales, from the window and what is remembered."""
         inlying = fit.noise.inlying(fit.residuals, intervals.known)
         noise = fit.noise.of_sums(NoiseSums.of(fit.residuals, intervals.known, inlying).plus(self.memory.noise))

@@ -12,7 +12,7 @@ from diransac.identification.methods.lo_diransac.recording_errors import LEAST_D
 from diransac.text_table import duration, number, percent
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
 
@@ -44,7 +44,7 @@ def findings_of_fit(found: Explanation, acting: ActingInputs | None) -> Iterator
                 )
 
 
-def _of_recordings(intervals: ShootingIntervals) -> Iterator[Finding]:
+def _of_recordings(intervals: Windows) -> Iterator[Finding]:
     """Delays and biases of sensors, own delays and lags of inputs, and drifts of their gains."""
     errors = intervals.all_errors
     signals = np.array(intervals.model.signals)

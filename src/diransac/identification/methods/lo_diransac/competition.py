@@ -41,7 +41,7 @@ from diransac.simulation import HOLDS
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
@@ -73,7 +73,7 @@ def is_settled(explanation: Explanation, motion: Motion) -> bool:
 def compete(
     settings: LoDiransacSettings,
     dataset: Dataset,
-    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+    whole: tuple[Windows, Motion, tuple[str, ...]],
     seed: int,
     callback: Callback | None,
 ) -> Searched:
@@ -121,7 +121,7 @@ class Contest:
     ----------
     settings : LoDiransacSettings
     dataset : Dataset
-    intervals : ShootingIntervals
+    intervals : Windows
         With inputs and measurements as recorded.
     motion : Motion
         Smoothed motion over their rows.
@@ -133,7 +133,7 @@ class Contest:
 
     settings: LoDiransacSettings
     dataset: Dataset
-    intervals: ShootingIntervals
+    intervals: Windows
     motion: Motion
     notes: tuple[str, ...]
     seed: int

@@ -12,12 +12,12 @@ from diransac.identification.diagnosis import Diagnosis
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.core.noise import Mixture
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 
 def diagnosis_of(
     dataset: Dataset,
-    intervals: ShootingIntervals,
+    intervals: Windows,
     fitted: tuple[Mixture, FloatArray, FloatArray],
     unexplained: FloatArray,
     unidentifiable: tuple[tuple[str, ...], tuple[str, ...]],
@@ -27,7 +27,7 @@ def diagnosis_of(
     Parameters
     ----------
     dataset : Dataset
-    intervals : ShootingIntervals
+    intervals : Windows
         Of its logs.
     fitted : (Mixture, (N, n_s) array, (W, n_x) array)
         Noise, simulated less measured signals, and the states at the intervals' starts.
@@ -74,7 +74,7 @@ def diagnosis_of(
     )
 
 
-def by_acceleration(intervals: ShootingIntervals, values: FloatArray) -> dict[str, FloatArray]:
+def by_acceleration(intervals: Windows, values: FloatArray) -> dict[str, FloatArray]:
     """Figures ``(W, n_v)`` of intervals by the name of the acceleration, of those that begin in a log."""
     shown = intervals.is_logged[intervals.starts]
     return dict(zip(intervals.model.accelerations, values[shown].T.copy(), strict=True))

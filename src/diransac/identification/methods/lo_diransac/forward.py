@@ -28,7 +28,7 @@ from diransac.identification.methods.lo_diransac.segments import (
 )
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.methods.lo_diransac.sources import Blocks, Candidate
 
@@ -48,7 +48,7 @@ class Reference:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         The logs, as recorded.
     motion : Motion
         Smoothed without the model; states start from it that nothing measures.
@@ -59,14 +59,14 @@ class Reference:
         Standard deviation of each signal, by which samples before a prediction are weighted.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     motion: Motion
     blocks: Blocks
     inlying: BoolArray
     noise: FloatArray
 
 
-def horizons_of(intervals: ShootingIntervals, horizon: float | None) -> list[int]:
+def horizons_of(intervals: Windows, horizon: float | None) -> list[int]:
     """Horizons in rows, the shortest first: the user's, s, or multiples of the time scale of the measured states.
 
     The scale is the median over the states of the time in which they change by half of what they ever do.
@@ -91,7 +91,7 @@ def _longest(parts: Sequence[slice]) -> int:
     return max((x.stop - x.start for x in parts), default=0)
 
 
-def _placed(intervals: ShootingIntervals, blocks: Blocks, n_before: int, n_after: int) -> tuple[IntArray, IntArray]:
+def _placed(intervals: Windows, blocks: Blocks, n_before: int, n_after: int) -> tuple[IntArray, IntArray]:
     """First rows of segments within a stretch, spread over the blocks, and the block of the middle of each."""
     placed = []
     for part in stretches(intervals):

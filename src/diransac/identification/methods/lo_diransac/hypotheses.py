@@ -27,7 +27,7 @@ from diransac.simulation import RolloutBatch, rollouts
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.identification.regression.estimators import BoundEstimator
@@ -46,7 +46,7 @@ _SMALL_RESIDUAL = 0.01
 
 
 def find_hypotheses(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: Windows, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Hypotheses within the parameter bounds, best first.
 
@@ -55,7 +55,7 @@ def find_hypotheses(
     Parameters
     ----------
     settings : LoDiransacSettings
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     seed : int
@@ -77,7 +77,7 @@ def find_hypotheses(
 
 
 def _linear(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: Windows, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Finalists of a model that is affine in its parameters: the best of least squares of random averages.
 
@@ -120,7 +120,7 @@ def _in_sensors_alone(dataset: Dataset) -> BoolArray:
 
 
 def _nonlinear(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: Windows, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Finalists of any model: nonlinear least squares of all and of random rows of the smoothed motion."""
     bound = _of_smoothed_motion(intervals, motion, dataset)
@@ -130,7 +130,7 @@ def _nonlinear(
     return bound.select([np.arange(n), *samples]).fit()
 
 
-def _of_smoothed_motion(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> BoundEstimator:
+def _of_smoothed_motion(intervals: Windows, motion: Motion, dataset: Dataset) -> BoundEstimator:
     """Nonlinear least squares over the dataset with smoothed signals, of which every row counts."""
     from diransac.identification.regression.nonlinear import NonlinearLeastSquares
 
@@ -180,12 +180,12 @@ def _sizes(seed: int, k: IntArray, n: int, n_p: int) -> IntArray:
     return np.asarray(np.minimum(n_p + drawn, n))
 
 
-def weak_form(intervals: ShootingIntervals, motion: Motion) -> Rows:
+def weak_form(intervals: Windows, motion: Motion) -> Rows:
     """Rows of the smoothed motion, averaged under overlapping bumps that lie within one log each.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
 
@@ -226,12 +226,12 @@ def bump_of(n_rows: int) -> FloatArray:
     return np.asarray(bump / bump.sum())
 
 
-def firsts_of(intervals: ShootingIntervals, rows: slice) -> IntArray:
+def firsts_of(intervals: Windows, rows: slice) -> IntArray:
     """First rows of overlapping averages of an interval's length, within one log and outside of its gaps.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     rows : slice
         Those of the log.
     """
@@ -292,20 +292,20 @@ def _median_size(values: FloatArray) -> FloatArray:
     return np.asarray(np.median(np.abs(values), axis=0))
 
 
-def _admitted(intervals: ShootingIntervals, p: FloatArray) -> FloatArray:
+def _admitted(intervals: Windows, p: FloatArray) -> FloatArray:
     """Hypotheses clipped to inclusive bounds, without those that violate a strict one."""
     p = np.clip(p, *inclusive_bounds(intervals.layout.bounds))
     return p[intervals.layout.admits(p)]
 
 
-def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
+def robust_scores(intervals: Windows, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
     """Sum over signals of the log of the 35 % quantile of ``|residual|``, by simulation from the smoothed states.
 
     The score needs no threshold, and its order does not depend on units.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     parameters : (n_hypotheses, n) array
@@ -322,7 +322,7 @@ def robust_scores(intervals: ShootingIntervals, motion: Motion, parameters: Floa
     return np.concatenate([_scores(intervals, motion, part, chosen) for part in parts])
 
 
-def _scores(intervals: ShootingIntervals, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
+def _scores(intervals: Windows, motion: Motion, parameters: FloatArray, chosen: IntArray) -> FloatArray:
     """Scores of hypotheses, as `robust_scores`, all at a time."""
     n, n_x = len(parameters), intervals.model.n_q + intervals.model.n_v
     starts, logs = intervals.starts[chosen], np.tile(intervals.log_of[chosen], n)

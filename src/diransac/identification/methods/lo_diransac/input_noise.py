@@ -25,7 +25,7 @@ from diransac.identification.core.fit import split, weights_of, with_residuals
 from diransac.identification.core.minimise import Refinement, minimise
 from diransac.identification.core.noise import NoiseSums
 from diransac.identification.core.scales import CONTINUITY, SHRINK, negligible_jumps, process_sums
-from diransac.identification.core.theta import ErrorKind
+from diransac.identification.core.theta import EffectKind
 from diransac.identification.methods.lo_diransac.missing_terms import candidates_of_fit, missing_terms
 from diransac.identification.methods.lo_diransac.motion_equations import unexplained
 from diransac.identification.methods.lo_diransac.projection import fitted_parameters
@@ -33,7 +33,7 @@ from diransac.identification.methods.lo_diransac.projection import fitted_parame
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
     from diransac.identification.core.minimise import Prior, Step
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
     from diransac.identification.structure.candidate_terms import TermLibrary
@@ -60,13 +60,13 @@ _CLEAR = 3.0
 _SLOW = 0.5
 
 
-def refine_noisy(settings: LoDiransacSettings, intervals: ShootingIntervals, fit: Fit, prior: Prior) -> Refinement:
+def refine_noisy(settings: LoDiransacSettings, intervals: Windows, fit: Fit, prior: Prior) -> Refinement:
     """Fit of the exact model with noise of its inputs.
 
     Parameters
     ----------
     settings : LoDiransacSettings
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         Initial fit, with unmodelled accelerations or with noise of inputs.
     prior : Prior
@@ -87,12 +87,12 @@ def refine_noisy(settings: LoDiransacSettings, intervals: ShootingIntervals, fit
     return minimise(intervals, fit, Noisy(settings, least, unbroken), settings.max_steps)
 
 
-def _sizes(intervals: ShootingIntervals) -> FloatArray:
+def _sizes(intervals: Windows) -> FloatArray:
     """RMS ``(n_u,)`` of each input; 1 of one that never acts."""
     return size_or_one(np.sqrt(np.square(intervals.recorded).mean(axis=0)))
 
 
-def _with_errors(intervals: ShootingIntervals, fit: Fit) -> tuple[ShootingIntervals, Fit]:
+def _with_errors(intervals: Windows, fit: Fit) -> tuple[Windows, Fit]:
     """The intervals, split, and the fit with errors of inputs instead of unmodelled accelerations; all vanish yet."""
     n = fit.x.shape[1] + intervals.model.n_u + intervals.n_p
     divisors = [k for k in range(1, intervals.length + 1) if intervals.length % k == 0]
@@ -150,12 +150,12 @@ def _noise_sums(taken: Step) -> NoiseSums:
     return replace(sums, squares=sums.squares / (1.0 - share))
 
 
-def noise_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def noise_of_inputs(intervals: Windows, fit: Fit) -> FloatArray:
     """Standard deviation ``(n_u,)`` of the noise of each input, its unit; 0 where the logs show none.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     """
     if not intervals.noisy:
@@ -164,7 +164,7 @@ def noise_of_inputs(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return np.where(noise > 2.0 * _NONE * _sizes(intervals), noise, 0.0)
 
 
-def averaged_noise(intervals: ShootingIntervals, fit: Fit) -> float:
+def averaged_noise(intervals: Windows, fit: Fit) -> float:
     """Negative log evidence by which noise is less likely as it was recorded than as it acts; 0 without noise, nats.
 
     A lag, a fraction of a sample by which a held input is late, and interpolation average the noise of samples.  The
@@ -183,21 +183,21 @@ def averaged_noise(intervals: ShootingIntervals, fit: Fit) -> float:
     return float(-0.5 * ((1.0 - left).sum(axis=0) * np.log(power)).sum())
 
 
-def simpler_timings(intervals: ShootingIntervals, *, free_hold: bool) -> list[ShootingIntervals]:
+def simpler_timings(intervals: Windows, *, free_hold: bool) -> list[Windows]:
     """The intervals with delays and lags of all inputs alone; and with delays of whole samples instead of any.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     free_hold : bool
         Whether inputs may be held, too, where they are interpolated.
 
     Returns
     -------
-    list of ShootingIntervals
+    list of Windows
         Those that differ.
     """
-    sizes, late = intervals.all_errors.sizes, defaultdict[ErrorKind, float](float)
+    sizes, late = intervals.all_errors.sizes, defaultdict[EffectKind, float](float)
     timings = [kind for kind in sizes if kind.of_inputs and kind.what != "drift"]
     for kind in timings:
         late[replace(kind, what="delay")] += sizes[kind]
@@ -210,12 +210,12 @@ def simpler_timings(intervals: ShootingIntervals, *, free_hold: bool) -> list[Sh
     return [replace(intervals, errors=replace(intervals.all_errors, sizes=x), hold=hold) for x, hold in differs]
 
 
-def may_explain(intervals: ShootingIntervals, fit: Fit, prior: Prior, projected: FloatArray | None) -> bool:
+def may_explain(intervals: Windows, fit: Fit, prior: Prior, projected: FloatArray | None) -> bool:
     """True if an exact model leaves white accelerations, or if some of those that a flexible one leaves vary fast.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     prior : Prior
         Its size of unmodelled accelerations is that with which an exact model is tested for them.
@@ -236,14 +236,12 @@ def may_explain(intervals: ShootingIntervals, fit: Fit, prior: Prior, projected:
     return bool((sums.surplus > _CLEAR * np.sqrt(2.0 * sums.weight)).any())
 
 
-def explains_all(
-    intervals: ShootingIntervals, fit: Fit, library: TermLibrary | None, *, instead_of_exact: bool
-) -> bool:
+def explains_all(intervals: Windows, fit: Fit, library: TermLibrary | None, *, instead_of_exact: bool) -> bool:
     """True if inputs have noise, which is white, and no term of the motion explains it.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum, with noise of inputs.
     library : callable or None
@@ -257,7 +255,7 @@ def explains_all(
     return not missing_terms(candidates_of_fit(*moved, library)).suggestions
 
 
-def is_white(intervals: ShootingIntervals, fit: Fit, seen: float) -> bool:
+def is_white(intervals: Windows, fit: Fit, seen: float) -> bool:
     """True if noise of inputs and of signals is white: without power at low frequencies, and without bursts.
 
     Errors of inputs may take up the forces that a model lacks, which have both.  Estimates of errors, and their sums
@@ -266,7 +264,7 @@ def is_white(intervals: ShootingIntervals, fit: Fit, seen: float) -> bool:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum, with noise of inputs.
     seen : float
@@ -296,13 +294,13 @@ def is_white(intervals: ShootingIntervals, fit: Fit, seen: float) -> bool:
 
 
 def with_accelerations(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate
-) -> tuple[ShootingIntervals, Fit, ProjectedEstimate]:
+    intervals: Windows, fit: Fit, result: ProjectedEstimate
+) -> tuple[Windows, Fit, ProjectedEstimate]:
     """The same motion with unmodelled accelerations instead of the noise of inputs, whose size they have.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     result : ProjectedEstimate
     """

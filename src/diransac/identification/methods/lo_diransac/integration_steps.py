@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from diransac.identification.core.arrowhead import Factored
     from diransac.identification.core.equations import NormalEquations
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 _NEGLIGIBLE = 0.1
 """Change of a parameter, standard errors, that adds half a per cent to its uncertainty."""
@@ -30,12 +30,12 @@ _FEW = (2, 3)
 """Numbers of steps that are tried; one would need machine code of its own."""
 
 
-def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tuple[ShootingIntervals, Fit]:
+def with_fewest_steps(intervals: Windows, fit: Fit, most: int) -> tuple[Windows, Fit]:
     """The intervals with the fewest integration steps per sample by which no parameter of the fit changes noticeably.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum.
     most : int
@@ -43,7 +43,7 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
 
     Returns
     -------
-    ShootingIntervals, Fit
+    Windows, Fit
         The fit is at its optimum with these steps; only simulated again with `most` of them.
     """
     finest = replace(intervals, substeps=most)
@@ -58,25 +58,23 @@ def with_fewest_steps(intervals: ShootingIntervals, fit: Fit, most: int) -> tupl
     return finest, accurate
 
 
-def _after_step(intervals: ShootingIntervals, fit: Fit, step: Factored) -> Fit:
+def _after_step(intervals: Windows, fit: Fit, step: Factored) -> Fit:
     """The fit after a step within the bounds, simulated over some intervals."""
     shared, n_x = bounded(intervals, fit.shared, fit.shared + step.step_p), fit.x.shape[1]
     z = step.step_z - step.gain @ (shared - fit.shared - step.step_p)
     return with_residuals(intervals, replace(fit, shared=shared, x=fit.x + z[:, :n_x], d=fit.d + z[:, n_x:]))
 
 
-def answer(
-    intervals: ShootingIntervals, at: NormalEquations, fit: Fit, other: ShootingIntervals
-) -> tuple[Factored, float]:
+def answer(intervals: Windows, at: NormalEquations, fit: Fit, other: Windows) -> tuple[Factored, float]:
     """Gauss-Newton step for other residuals and ends of a fit, and how the cost changes with both, nats.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     at : NormalEquations
     fit : Fit
         At its optimum.
-    other : ShootingIntervals
+    other : Windows
         Those that simulate the other residuals and ends.
 
     Returns

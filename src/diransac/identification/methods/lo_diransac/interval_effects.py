@@ -15,7 +15,7 @@ from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 # Fewest batches of correlated intervals.
 _BATCHES = 4
@@ -43,7 +43,7 @@ class EffectOfIntervals:
     s: FloatArray
 
 
-def effect_of_intervals(intervals: ShootingIntervals, fit: Fit) -> EffectOfIntervals:
+def effect_of_intervals(intervals: Windows, fit: Fit) -> EffectOfIntervals:
     """Effect of each interval's measurements on the parameters of a fit at its optimum."""
     n_p, n_s, k = intervals.n_p, len(fit.shared), fit.x.shape[1] + fit.d.shape[1]
     at = linearize(intervals, fit, weights_of(intervals, fit))

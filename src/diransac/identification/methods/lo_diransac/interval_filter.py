@@ -26,7 +26,7 @@ from diransac.simulation import Measurements, RolloutBatch, Simulator, rollouts
 from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 TINY = 1e-12
 """Least scale of anything, its unit: beside rounding errors of what has a size of about one."""
@@ -278,7 +278,7 @@ class IntervalFilter:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     noise : Mixture
     lack : float
         Change of a velocity in an interval that the model lacks, over the change that it predicts; at first a third.
@@ -291,7 +291,7 @@ class IntervalFilter:
         None: local ones.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     noise: Mixture
     lack: float = 0.3
     delay: float = 0.0
@@ -299,7 +299,7 @@ class IntervalFilter:
     spread: FloatArray | None = None
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, *, outliers: bool, free_delay: bool) -> IntervalFilter:
+    def of(cls, intervals: Windows, *, outliers: bool, free_delay: bool) -> IntervalFilter:
         """A filter with noise by the second differences of each signal."""
         n = len(intervals.model.signals)
         spread, noise, half = np.ones(n), np.ones(n), np.ones(n)

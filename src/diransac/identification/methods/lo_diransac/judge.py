@@ -29,7 +29,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import unmeasured_st
 from diransac.identification.regression.uncertainty import student_quantile
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.forward import Reference
     from diransac.identification.methods.lo_diransac.segments import ActingInputs
     from diransac.identification.methods.lo_diransac.sources import Candidate
@@ -213,7 +213,7 @@ def _between(acting: ActingInputs) -> FloatArray:
     return 0.5 * (u + np.concatenate([u[:1], u[:-1]])) if acting.hold == "zero-order" else u
 
 
-def equations_of_measured_states(intervals: ShootingIntervals) -> IntArray:
+def equations_of_measured_states(intervals: Windows) -> IntArray:
     """Equations in which no unmeasured state enters, nor a derivative of it."""
     model, unmeasured = intervals.model, unmeasured_states(intervals)
     hidden = [name for chain in model.chains if not set(unmeasured).isdisjoint(chain) for name in chain]

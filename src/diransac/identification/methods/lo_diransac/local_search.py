@@ -22,8 +22,8 @@ from diransac.errors import TimeLimitError
 from diransac.identification.core.equations import linearized
 from diransac.identification.core.fit import split, with_residuals
 from diransac.identification.core.minimise import refine, refine_exact, refine_further, start
-from diransac.identification.core.theta import ErrorKind
-from diransac.identification.core.windows import SHORTEST_LAG, ShootingIntervals
+from diransac.identification.core.theta import EffectKind
+from diransac.identification.core.windows import SHORTEST_LAG, Windows
 from diransac.identification.method import report
 from diransac.identification.methods.lo_diransac.input_noise import (
     averaged_noise,
@@ -89,7 +89,7 @@ class Explanation:
     complete: bool = True
 
     @property
-    def intervals(self) -> ShootingIntervals:
+    def intervals(self) -> Windows:
         """The logs, with the most probable errors of the recordings."""
         return self.refinement.intervals
 
@@ -140,14 +140,12 @@ class LocalSearch:
     prior: Prior
     callback: Callback | None
 
-    def likeliest(
-        self, intervals: ShootingIntervals, *, free_hold: bool, rival: Explanation | None = None
-    ) -> Explanation:
+    def likeliest(self, intervals: Windows, *, free_hold: bool, rival: Explanation | None = None) -> Explanation:
         """The likeliest explanation of the log.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
             With inputs as recorded.
         free_hold : bool
             Whether another hold of the inputs may be an explanation.
@@ -179,7 +177,7 @@ class LocalSearch:
         return best
 
     def _ever_likelier(
-        self, intervals: ShootingIntervals, rival: Explanation | None, *, free_hold: bool
+        self, intervals: Windows, rival: Explanation | None, *, free_hold: bool
     ) -> Iterator[Explanation]:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
@@ -234,7 +232,7 @@ class LocalSearch:
 
         That of all inputs is found first where one is late; those that are not then seem early by as much.
         """
-        intervals, fewer = found.intervals, list[ShootingIntervals]()
+        intervals, fewer = found.intervals, list[Windows]()
         sizes, sought = intervals.all_errors.sizes, self._sought(found)
         for common in (x for x in map(intervals.all_inputs, LATE) if x in sizes and x in sought):
             alone = intervals.without_error(common)
@@ -244,12 +242,12 @@ class LocalSearch:
         leanest = min((self._moved(found, x) for x in fewer), key=lambda x: x.cost, default=found)
         return leanest if leanest.cost < found.cost + AS_LIKELY else found
 
-    def continued(self, intervals: ShootingIntervals, fit: Fit, begin: Explanation) -> Explanation:
+    def continued(self, intervals: Windows, fit: Fit, begin: Explanation) -> Explanation:
         """The likeliest explanation of a part of some logs, from a fit of that part with the freedom of all.
 
         Parameters
         ----------
-        intervals : ShootingIntervals
+        intervals : Windows
             Of the part, with the errors of all.
         fit : Fit
             Of the part.
@@ -279,19 +277,19 @@ class LocalSearch:
         )
         return found
 
-    def _named(self, intervals: ShootingIntervals) -> list[ErrorKind]:
+    def _named(self, intervals: Windows) -> list[EffectKind]:
         """Errors of recordings that the settings name, or require of all inputs."""
         model, settings = intervals.model, self.settings
         required = {"delay": settings.input_delay, "lag": settings.input_lag}
         signals, inputs = model.signals.index, list(model.inputs).index
         delays = settings.sensor_delays or ()
         named = [intervals.all_inputs(what) for what in LATE if required[what]]
-        named += [ErrorKind((signals(x),), "delay") for x in delays if x not in model.inputs]
-        named += [ErrorKind((inputs(x),), "delay", of_inputs=True) for x in delays if x in model.inputs]
-        named += [ErrorKind((signals(x),), "bias") for x in settings.sensor_biases or ()]
-        return [*named, *(ErrorKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ())]
+        named += [EffectKind((signals(x),), "delay") for x in delays if x not in model.inputs]
+        named += [EffectKind((inputs(x),), "delay", of_inputs=True) for x in delays if x in model.inputs]
+        named += [EffectKind((signals(x),), "bias") for x in settings.sensor_biases or ()]
+        return [*named, *(EffectKind((inputs(x),), "drift", of_inputs=True) for x in settings.gain_drifts or ())]
 
-    def _sought(self, best: Explanation) -> list[ErrorKind]:
+    def _sought(self, best: Explanation) -> list[EffectKind]:
         """Errors of recordings that the settings leave to the evidence.
 
         Where the model is exact, inputs, groups of signals and single signals of its measurement equations are tested:
@@ -305,7 +303,7 @@ class LocalSearch:
         own = {"delay": settings.sensor_delays, "lag": settings.sensor_delays, "bias": settings.sensor_biases}
         own["drift"] = settings.gain_drifts
 
-        def admits(kind: ErrorKind) -> bool:
+        def admits(kind: EffectKind) -> bool:
             if kind in late and not intervals.noisy:
                 other = settings.input_lag if kind.what == "delay" else settings.input_delay
                 return switches[kind.what] is not False and not other
@@ -335,8 +333,8 @@ class LocalSearch:
         return [x for x in found if x is not best]
 
     def _timings(
-        self, best: Explanation, error: RecordingError | None, sought: Sequence[ErrorKind], *, free_hold: bool
-    ) -> list[ShootingIntervals]:
+        self, best: Explanation, error: RecordingError | None, sought: Sequence[EffectKind], *, free_hold: bool
+    ) -> list[Windows]:
         """Other timings of all inputs: what an error suggests, a lag instead of a delay, or another hold."""
         intervals, (delay, lag) = best.intervals, (best.intervals.all_inputs(what) for what in LATE)
         sizes, others = intervals.all_errors.sizes, []
@@ -354,24 +352,24 @@ class LocalSearch:
         found = [intervals.with_input_error(error.kind, error.size)] if error else []
         return found + (self._promising(best, others) if others and {delay, lag} & sizes.keys() else others)
 
-    def _promising(self, now: Explanation, others: Sequence[ShootingIntervals]) -> list[ShootingIntervals]:
+    def _promising(self, now: Explanation, others: Sequence[Windows]) -> list[Windows]:
         """Other timings but those with which a fit is less likely than with its own, at the optimum of which it is.
 
         To first order, after the step that answers the change of the simulations.
         """
         own, fit, at = now.intervals, now.refinement.fit, linearized(now.intervals, now.refinement.fit).of_fit
 
-        def change(other: ShootingIntervals) -> float:
+        def change(other: Windows) -> float:
             step, cost = answer(own, at, fit, other)
             return float(cost - (at.right_z * step.step_z).sum() - at.right_s @ step.step_p)
 
         return [x for x in others if not change(x) > AS_LIKELY]
 
-    def _moved(self, now: Explanation, intervals: ShootingIntervals) -> Explanation:
+    def _moved(self, now: Explanation, intervals: Windows) -> Explanation:
         """The explanation with other inputs, and the same freedom."""
         return self._optimised(now, intervals, with_residuals(intervals, now.refinement.fit))
 
-    def _optimised(self, now: Explanation, intervals: ShootingIntervals, begin: Fit) -> Explanation:
+    def _optimised(self, now: Explanation, intervals: Windows, begin: Fit) -> Explanation:
         """The explanation of other intervals with the same freedom."""
         if not now.exact:
             return replace(now, refinement=refine(self.settings, intervals, begin, self.prior))
@@ -405,7 +403,7 @@ class LocalSearch:
         others = [x for x in others if x.cost < now.cost - AS_LIKELY and (x.exact or explains(x))]
         return min(others, key=lambda x: x.cost, default=now)
 
-    def _from_hypothesis(self, intervals: ShootingIntervals) -> Explanation:
+    def _from_hypothesis(self, intervals: Windows) -> Explanation:
         """Local optimisation from the best hypothesis, with unmodelled accelerations."""
         report(self.callback, "local optimisation", 0.1)
         settings, prior = self.settings, self.prior
@@ -471,7 +469,7 @@ class LocalSearch:
                     best = noisy
         return found if best is None or (found.exact and best.cost > found.cost - AS_LIKELY) else best
 
-    def _noisy(self, found: Explanation, intervals: ShootingIntervals) -> Explanation | None:
+    def _noisy(self, found: Explanation, intervals: Windows) -> Explanation | None:
         """The exact model with noise of its inputs over intervals; None where it is not noise that is left."""
         fit, p = found.refinement.fit, found.refinement.fit.shared[: intervals.n_p]
         p = p if found.exact else found.projected
@@ -487,7 +485,7 @@ class LocalSearch:
             return None
         return replace(found, refinement=refined, exact=True) if is_noise else None
 
-    def _exact(self, intervals: ShootingIntervals, begin: Fit, rival: Explanation) -> Explanation | None:
+    def _exact(self, intervals: Windows, begin: Fit, rival: Explanation) -> Explanation | None:
         """The exact model from a motion, with all integration steps: it is one simulation of the whole log.
 
         None if simulations overflow from there.

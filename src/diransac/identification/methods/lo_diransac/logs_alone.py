@@ -21,7 +21,7 @@ from diransac.identification.methods.lo_diransac.simulation_error import estimat
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 
@@ -85,7 +85,7 @@ def _estimate_of_log(settings: LoDiransacSettings, one: Dataset, found: Searched
     return LogEstimate(values, spans, *delay)
 
 
-def _of_log(intervals: ShootingIntervals, fit: Fit, i: int) -> Fit:
+def _of_log(intervals: Windows, fit: Fit, i: int) -> Fit:
     """The part of a fit that is of one log."""
     chosen, rows = intervals.log_of == i, intervals.rows_of_logs[i]
     place = np.concatenate([intervals.layout.index[i], np.arange(intervals.n_p, len(fit.shared))])

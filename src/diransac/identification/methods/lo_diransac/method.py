@@ -17,7 +17,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError, SettingsError
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.diagnosis import Diagnosis, Resolution
 from diransac.identification.estimate import TIME_LIMIT, Estimate
 from diransac.identification.finding import Finding
@@ -308,7 +308,7 @@ def _checks_of_unmeasured(settings: LoDiransacSettings, dataset: Dataset, found:
             return
 
 
-def _equivalents(dataset: Dataset, intervals: ShootingIntervals, parameters: FloatArray) -> list[FloatArray]:
+def _equivalents(dataset: Dataset, intervals: Windows, parameters: FloatArray) -> list[FloatArray]:
     """Other admissible parameters that have the transfer function of given ones.
 
     Where all states are measured, equations of motion determine the parameters, and there are none.
@@ -416,7 +416,7 @@ def _diagnosis(
 
 
 def _forces_of(
-    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, accelerations: Sequence[FloatArray]
+    intervals: Windows, fit: Fit, parameters: FloatArray, accelerations: Sequence[FloatArray]
 ) -> list[FloatArray]:
     """Generalised forces (W, n_v) of accelerations at the intervals' starts; none if nothing is a balance of forces."""
     model = intervals.model

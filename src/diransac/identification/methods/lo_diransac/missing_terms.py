@@ -58,7 +58,7 @@ from diransac.identification.structure.structural import structural
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.structure.candidate_terms import CandidateTerms
     from diransac.identification.structure.lacking_terms import Suggestion
@@ -317,7 +317,7 @@ class MissingTerms:
 
 
 def candidates_of_fit(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, library: TermLibrary | None = None
+    intervals: Windows, fit: Fit, result: ProjectedEstimate, library: TermLibrary | None = None
 ) -> Candidates:
     """Candidate terms of a model, of the user's `library` too, with all that a fit says about them."""
     p = fit.shared[: intervals.n_p]
@@ -397,7 +397,7 @@ def possible_terms(
 
 
 def _library(
-    intervals: ShootingIntervals, motion: Sequence[FloatArray], drawn: Sequence[FloatArray], library: TermLibrary | None
+    intervals: Windows, motion: Sequence[FloatArray], drawn: Sequence[FloatArray], library: TermLibrary | None
 ) -> CandidateTerms:
     """Candidates with the speeds and inputs of a motion: q, v, a, u and p of every row."""
     velocities, inputs = (x[intervals.counted] for x in (motion[1], motion[3]))
@@ -409,25 +409,25 @@ def _library(
     return candidate_terms(intervals.model, np.sqrt(np.square(velocities).mean(axis=0)), sizes, relative, library)
 
 
-def _weights_of_rows(intervals: ShootingIntervals) -> FloatArray:
+def _weights_of_rows(intervals: Windows) -> FloatArray:
     """Weights ``(N,)`` of the rows of each interval in its mean: equal for those that count, 0 for others."""
     counted = intervals.counted.astype(float)
     counts = np.maximum(counted.reshape(len(intervals), -1).sum(axis=1), 1.0)
     return np.asarray(counted / np.repeat(counts, intervals.length))
 
 
-def _means(intervals: ShootingIntervals, values: FloatArray) -> FloatArray:
+def _means(intervals: Windows, values: FloatArray) -> FloatArray:
     """Means ``(W, ...)`` of the rows that count; 0 in intervals without one."""
     weights = _weights_of_rows(intervals)
     weighted = np.where(weights > 0.0, values.T * weights, 0.0).T
     return np.asarray(weighted.reshape(len(intervals), intervals.length, *values.shape[1:]).sum(axis=1))
 
 
-def _mean_inertia(intervals: ShootingIntervals, M: FloatArray) -> FloatArray:
+def _mean_inertia(intervals: Windows, M: FloatArray) -> FloatArray:
     return np.where(intervals.occupied[:, None, None], means_of_intervals(intervals, M), np.eye(M.shape[1]))
 
 
-def _inertia_slopes(intervals: ShootingIntervals, drawn: Sequence[FloatArray]) -> FloatArray:
+def _inertia_slopes(intervals: Windows, drawn: Sequence[FloatArray]) -> FloatArray:
     """Slopes ``(n,)`` of the logarithm of the logs' mean inertia by the parameters of all logs."""
     (q, v, _, u, p), places = drawn, intervals.layout.index
     slopes: FloatArray = np.zeros(intervals.n_p)
@@ -439,7 +439,7 @@ def _inertia_slopes(intervals: ShootingIntervals, drawn: Sequence[FloatArray]) -
 
 
 def _largest_forces(
-    intervals: ShootingIntervals, a: FloatArray, p: FloatArray, r: FloatArray, W: FloatArray, M: FloatArray
+    intervals: Windows, a: FloatArray, p: FloatArray, r: FloatArray, W: FloatArray, M: FloatArray
 ) -> FloatArray:
     """RMS (n_v,) of the largest force of each equation: inertial, of a parameter, or without one.
 
@@ -454,7 +454,7 @@ def _largest_forces(
     return np.asarray(np.sqrt(np.concatenate(squares).max(axis=0) / len(a)))
 
 
-def _drawn(intervals: ShootingIntervals, motion: Sequence[FloatArray]) -> tuple[tuple[FloatArray, ...], FloatArray]:
+def _drawn(intervals: Windows, motion: Sequence[FloatArray]) -> tuple[tuple[FloatArray, ...], FloatArray]:
     """Motions of the model drawn from the log signal by signal, so that nothing is correlated, and their regressors.
 
     Velocities and inputs have proportions that they need not have had in the log.
@@ -530,7 +530,7 @@ def _over_first(unit: FloatArray, scale: FloatArray) -> FloatArray:
     return np.array([float(f"{x:.9g}") for x in found / found[found != 0.0][0]])
 
 
-def _never_determined(intervals: ShootingIntervals, candidates: Candidates) -> list[int]:
+def _never_determined(intervals: Windows, candidates: Candidates) -> list[int]:
     """Terms that parameters and states that nothing measures equal on any motion."""
     if not unmeasured_states(intervals):
         return []

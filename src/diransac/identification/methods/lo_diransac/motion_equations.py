@@ -15,7 +15,7 @@ from diransac.simulation.compiler import compile_map
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.model import Model
     from diransac.simulation.compiler import Map
@@ -23,14 +23,12 @@ if TYPE_CHECKING:
 _TINY = 1e-300
 
 
-def unexplained(
-    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray, *, recorded: bool = False
-) -> FloatArray:
+def unexplained(intervals: Windows, fit: Fit, parameters: FloatArray, *, recorded: bool = False) -> FloatArray:
     """``M^-1 r``: mean over each interval of the fitted accelerations that the model does not explain.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     parameters : (n,) array
     recorded : bool, optional
@@ -50,13 +48,13 @@ def unexplained(
 
 
 def residuals_of_motion(
-    intervals: ShootingIntervals, fit: Fit, parameters: FloatArray
+    intervals: Windows, fit: Fit, parameters: FloatArray
 ) -> tuple[tuple[FloatArray, ...], FloatArray, FloatArray, FloatArray]:
     """Residuals of the equations on the fitted motion, and their derivatives.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     parameters : (n,) array
 
@@ -148,12 +146,12 @@ def inertia_slopes(model: Model, q: FloatArray, v: FloatArray, u: FloatArray, p:
     return np.asarray(found / (max(len(usable), 1) * model.n_v))
 
 
-def slopes_of_delays(intervals: ShootingIntervals, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
+def slopes_of_delays(intervals: Windows, motion: Sequence[FloatArray], parameters: FloatArray) -> FloatArray:
     """Changes of the residuals per sample of a delay of each input.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : sequence of (N, ...) array
         q, v, a, and the inputs as they act.
     parameters : (n,) array
@@ -170,12 +168,12 @@ def slopes_of_delays(intervals: ShootingIntervals, motion: Sequence[FloatArray],
     return found
 
 
-def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+def discrepancy_units(intervals: Windows, motion: Motion, p: FloatArray) -> FloatArray:
     """Discrepancies that equal the inertial force of their equation.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     p : (n,) array
@@ -193,12 +191,12 @@ def discrepancy_units(intervals: ShootingIntervals, motion: Motion, p: FloatArra
     return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel()])
 
 
-def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+def parameter_units(intervals: Windows, motion: Motion, p: FloatArray) -> FloatArray:
     """Change of each parameter that equals the inertial force of an equation, or the spread of a sensor.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     p : (n,) array
@@ -222,12 +220,12 @@ def parameter_units(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
     return np.asarray(np.where(sizes.any(axis=1), smallest, 0.0))
 
 
-def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray) -> FloatArray:
+def inertial_forces(intervals: Windows, motion: Motion, p: FloatArray) -> FloatArray:
     """RMS of ``M a`` of each equation.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
     p : (n,) array
@@ -244,14 +242,14 @@ def inertial_forces(intervals: ShootingIntervals, motion: Motion, p: FloatArray)
     return np.asarray(np.sqrt(np.square(np.einsum("nji,nj->ni", M, a)).mean(axis=0)))
 
 
-def _smoothed(intervals: ShootingIntervals, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _smoothed(intervals: Windows, motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoothed coordinates, velocities, accelerations and the inputs of all logged rows."""
     model, logged = intervals.model, intervals.counted
     q, v, a, _ = motion.parts(model, logged)
     return q, v, a, intervals.inputs[logged]
 
 
-def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _motion(intervals: Windows, fit: Fit) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fitted coordinates, velocities, accelerations, and the inputs as they act, without noise, each (N, n)."""
     model = intervals.model
     series = intervals.rollouts.trajectories(intervals.batch(fit.shared, fit.x, fit.d))
@@ -264,18 +262,18 @@ def _motion(intervals: ShootingIntervals, fit: Fit) -> tuple[FloatArray, FloatAr
     )
 
 
-def _row_parameters(intervals: ShootingIntervals, values: FloatArray, *, logged: bool = False) -> FloatArray:
+def _row_parameters(intervals: Windows, values: FloatArray, *, logged: bool = False) -> FloatArray:
     """Parameters of the model: one vector for all rows, or (N, n_p) where logs differ; of logged rows, or all."""
     logs = intervals.log_of_row[intervals.counted] if logged else intervals.log_of_row
     return intervals.parameters_of(values[: intervals.n_p], logs)
 
 
-def _regressors(intervals: ShootingIntervals, columns: FloatArray) -> FloatArray:
+def _regressors(intervals: Windows, columns: FloatArray) -> FloatArray:
     """Regressors (N, r, n) from matrices that were stored column by column; zero in other logs' parameters."""
     return _by_log(intervals, _matrices(columns, intervals.model.n_p), intervals.log_of_row)
 
 
-def _by_log(intervals: ShootingIntervals, W: FloatArray, logs: IntArray) -> FloatArray:
+def _by_log(intervals: Windows, W: FloatArray, logs: IntArray) -> FloatArray:
     """Regressors (N, r, n_p) of rows with their columns in the places of their logs (N, r, n)."""
     if intervals.layout.is_shared:
         return W
@@ -302,12 +300,12 @@ def _sensor_slopes(model: Model) -> Map:
     return compile_map(ca.Function("sensor_slopes", [q, v, a, u, p], [S]))
 
 
-def means_of_intervals(intervals: ShootingIntervals, rows: FloatArray) -> FloatArray:
+def means_of_intervals(intervals: Windows, rows: FloatArray) -> FloatArray:
     """Mean of each interval.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     rows : (N, ...) array
 
     Returns

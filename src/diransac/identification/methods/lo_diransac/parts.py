@@ -33,7 +33,7 @@ from diransac.text_table import number, percent
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.local_search import Explanation
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
 
@@ -87,7 +87,7 @@ def compared_parts(found: Explanation, result: ProjectedEstimate) -> Parts:
     return _changing(intervals, fit, result, share[result.windows])
 
 
-def _changing(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
+def _changing(intervals: Windows, fit: Fit, result: ProjectedEstimate, share: FloatArray) -> Parts:
     """Halves and held-out fifths of the logs, where the model is not exact."""
     names, first, n = intervals.layout.names, share < 0.5, len(result.parameters)
     if min(first.sum(), (~first).sum()) < _FEWEST:
@@ -126,7 +126,7 @@ def _disagreement(names: Sequence[str], halves: FloatArray, parameters: FloatArr
     )
 
 
-def _equations(intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate) -> tuple[FloatArray, FloatArray]:
+def _equations(intervals: Windows, fit: Fit, result: ProjectedEstimate) -> tuple[FloatArray, FloatArray]:
     """Regressors (W, n_v, n) and residuals (W, n_v) of the fitted motion, in the mean over each window."""
     _, rows, regressors, _ = residuals_of_motion(intervals, fit, result.parameters)
     W = means_of_intervals(intervals, regressors * intervals.counted[:, None, None])
@@ -149,9 +149,7 @@ def _held_out(W: FloatArray, residuals: FloatArray, part: IntArray) -> float:
     return float(np.square(left / scale).sum() / size_or_one(np.square(fitted / scale).sum() * usual))
 
 
-def _deviation(
-    intervals: ShootingIntervals, fit: Fit, result: ProjectedEstimate, part: IntArray
-) -> tuple[Finding, ...]:
+def _deviation(intervals: Windows, fit: Fit, result: ProjectedEstimate, part: IntArray) -> tuple[Finding, ...]:
     """The part that agrees least with the others, where the model is exact; none if all agree, or if it is no matter.
 
     The measurements of part k change the parameters by ``u_k``, of variance ``V_k`` if the model is exact and the noise

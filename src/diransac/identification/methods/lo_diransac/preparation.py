@@ -10,7 +10,7 @@ import numpy as np
 from diransac.arrays import BoolArray, FloatArray, long_runs, robust_std, runs
 from diransac.data.segment import silent_rows
 from diransac.errors import LogError
-from diransac.identification.core.windows import ShootingIntervals
+from diransac.identification.core.windows import Windows
 from diransac.identification.methods.lo_diransac.smoothing import Motion, Samples, choose_half_widths, smooth
 from diransac.simulation import default_threads
 
@@ -25,7 +25,7 @@ FEWEST_INTERVALS = 4
 """Intervals of all logs at least, and of one that is compared with the others."""
 
 
-def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, Motion, tuple[str, ...]]:
+def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[Windows, Motion, tuple[str, ...]]:
     """The logs in intervals of the motion's own time scale, the motion in their rows, and notes.
 
     Raises
@@ -53,12 +53,10 @@ def prepared(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIn
     return intervals, Motion(np.concatenate(signals), motions[0].spread), notes
 
 
-def cut(settings: LoDiransacSettings, dataset: Dataset, samples: Sequence[Samples], length: int) -> ShootingIntervals:
+def cut(settings: LoDiransacSettings, dataset: Dataset, samples: Sequence[Samples], length: int) -> Windows:
     """Intervals of ``length`` rows, of the samples of each log."""
     logs = [(x.measured, x.known, log.inputs, x.gaps) for x, log in zip(samples, dataset.segments, strict=True)]
-    intervals = ShootingIntervals.of(
-        dataset.model, dataset.layout, logs, dataset.dt, length, settings.substeps, dataset.hold
-    )
+    intervals = Windows.of(dataset.model, dataset.layout, logs, dataset.dt, length, settings.substeps, dataset.hold)
     return replace(intervals, threads=settings.criteria.threads or default_threads())
 
 

@@ -51,7 +51,7 @@ from diransac.identification.regression.uncertainty import combined
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 _WIDER = 100.0
 """Factor of the standard deviations of priors in the covariance that is combined with them."""
@@ -88,12 +88,12 @@ class ProjectedEstimate:
     of_fit: FloatArray
 
 
-def estimate_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
+def estimate_parameters(intervals: Windows, fit: Fit) -> ProjectedEstimate:
     """Parameters that solve the equations on the fitted motion by least squares, and their covariance.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         Most probable motion.
 
@@ -107,13 +107,13 @@ def estimate_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEsti
 
 
 def projected_candidates(
-    intervals: ShootingIntervals, fit: Fit
+    intervals: Windows, fit: Fit
 ) -> Iterator[tuple[float, Callable[[], ProjectedEstimate], FloatArray, FloatArray]]:
     """Least squares on the fitted motion over windows of one interval, of two, of four, ..., while equations are many.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         Most probable motion.
 
@@ -138,13 +138,13 @@ def projected_candidates(
         yield seconds, partial(_completed, intervals, fit, rows, windows), p, parts
 
 
-def _completed(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
+def _completed(intervals: Windows, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
     """The estimate over some windows with its covariance, and with priors."""
     found = _solution(intervals, _with_wide_priors(intervals, fit), rows, windows)
     return _combined_with_priors(intervals, fit, found) if len(intervals.layout.with_prior) else found
 
 
-def _windows(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArray]:
+def _windows(intervals: Windows, n: int, n_v: int) -> Iterator[IntArray]:
     """First intervals of windows of one interval, of two, of four, ..., as long as equations are many."""
     place = np.arange(len(intervals)) - np.searchsorted(intervals.log_of, intervals.log_of)
     size = 1
@@ -156,12 +156,12 @@ def _windows(intervals: ShootingIntervals, n: int, n_v: int) -> Iterator[IntArra
         size *= 2
 
 
-def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
+def projected_parameters(intervals: Windows, fit: Fit) -> FloatArray:
     """Parameters ``(n,)`` that solve the equations on the fitted motion by least squares, without priors.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         Most probable motion.
 
@@ -174,7 +174,7 @@ def projected_parameters(intervals: ShootingIntervals, fit: Fit) -> FloatArray:
     return _bounded_projection(intervals, now, rows, np.arange(len(intervals)), CAUCHY)[0]
 
 
-def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstimate:
+def fitted_parameters(intervals: Windows, fit: Fit) -> ProjectedEstimate:
     """The parameters of the fit, and their covariance.
 
     The covariance of the fit assumes white noise.  It is increased where the scores of neighbouring intervals, which
@@ -182,7 +182,7 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
 
     Returns
@@ -198,13 +198,13 @@ def fitted_parameters(intervals: ShootingIntervals, fit: Fit) -> ProjectedEstima
     return ProjectedEstimate(p, covariance, left, windows, np.zeros_like(effect.z), np.eye(*effect.s.shape), p)
 
 
-def _with_wide_priors(intervals: ShootingIntervals, fit: Fit) -> Fit:
+def _with_wide_priors(intervals: Windows, fit: Fit) -> Fit:
     """The fit with priors of the parameters that hardly count, but keep its equations definite."""
     factor = np.where(np.arange(len(fit.prior)) < intervals.n_p, _WIDER, 1.0)
     return replace(fit, prior=factor * fit.prior)
 
 
-def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
+def _combined_with_priors(intervals: Windows, fit: Fit, found: ProjectedEstimate) -> ProjectedEstimate:
     """The estimate combined with what its covariance lacks of the priors.  Parameters on a bound stay there."""
     layout = intervals.layout
     variance = np.square(layout.prior_std[layout.with_prior]) / (1.0 - _WIDER**-2)
@@ -217,13 +217,13 @@ def _combined_with_priors(intervals: ShootingIntervals, fit: Fit, found: Project
 
 
 def with_parameters(
-    intervals: ShootingIntervals, fit: Fit, found: ProjectedEstimate, parameters: FloatArray
+    intervals: Windows, fit: Fit, found: ProjectedEstimate, parameters: FloatArray
 ) -> ProjectedEstimate:
     """The estimate with other parameters, and what these leave unexplained of the fitted motion.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     found : ProjectedEstimate
     parameters : (n,) array
@@ -265,7 +265,7 @@ class _Rows:
     inertial: FloatArray
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, fit: Fit) -> _Rows:
+    def of(cls, intervals: Windows, fit: Fit) -> _Rows:
         """Equations of the logged rows."""
         motion, push, W, M = residuals_of_motion(intervals, fit, fit.shared)
         logged = intervals.counted[:, None]
@@ -278,7 +278,7 @@ class _Rows:
         return cls(W, push, means_of_intervals(intervals, W), M, latent, attributed, inertial)
 
 
-def _solution(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
+def _solution(intervals: Windows, fit: Fit, rows: _Rows, windows: IntArray) -> ProjectedEstimate:
     """Parameters, and the first two parts of their covariance.
 
     The component of the discrepancies and of the unmodelled accelerations in the regressor's column space is attributed
@@ -299,7 +299,7 @@ def _solution(intervals: ShootingIntervals, fit: Fit, rows: _Rows, windows: IntA
 
 
 def _slopes(
-    intervals: ShootingIntervals, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray]
+    intervals: Windows, fit: Fit, rows: _Rows, gains: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives (W, k, n) and (n_s, n) of projected parameters with respect to the unknowns of the fit."""
     n_p, n_s, n_x = intervals.n_p, len(fit.shared), fit.x.shape[1]
@@ -312,14 +312,14 @@ def _slopes(
     return of_z, of_s
 
 
-def _covariance_of_fit(intervals: ShootingIntervals, fit: Fit, of_z: FloatArray, of_s: FloatArray) -> FloatArray:
+def _covariance_of_fit(intervals: Windows, fit: Fit, of_z: FloatArray, of_s: FloatArray) -> FloatArray:
     """Covariance (n, n) of the fit and of the errors of its sensors, propagated through the projection."""
     at = linearize(intervals, fit, weights_of(intervals, fit))
     z, s = at.system.functional(of_z, of_s)
     return np.asarray(np.einsum("wkc,wkd->cd", of_z, z) + of_s.T @ s + effect_on(intervals, fit, z, s))
 
 
-def _parts(intervals: ShootingIntervals, rows: _Rows, gains: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _parts(intervals: Windows, rows: _Rows, gains: tuple[FloatArray, FloatArray]) -> FloatArray:
     """Contributions of each interval's unmodelled forces to the error of the parameters, (W, n)."""
     by_rows, by_means = gains
     unmade = rows.latent - rows.means @ np.einsum("pwi,wi->p", by_means, rows.latent)
@@ -329,7 +329,7 @@ def _parts(intervals: ShootingIntervals, rows: _Rows, gains: tuple[FloatArray, F
 
 
 def _bounded_projection(
-    intervals: ShootingIntervals, now: FloatArray, rows: _Rows, windows: IntArray, loss: Loss | None
+    intervals: Windows, now: FloatArray, rows: _Rows, windows: IntArray, loss: Loss | None
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
     """Parameters within inclusive bounds, gains of rows (n, N, n_v) and of means (n, W, n_v), and those on a bound.
 
@@ -355,7 +355,7 @@ def _bounded_projection(
 
 
 def _gains(
-    intervals: ShootingIntervals, rows: _Rows, free: BoolArray, known: FloatArray, windows: IntArray, loss: Loss | None
+    intervals: Windows, rows: _Rows, free: BoolArray, known: FloatArray, windows: IntArray, loss: Loss | None
 ) -> tuple[FloatArray, FloatArray]:
     """Effects on the free parameters of every row (n, N, n_v), and of every interval (n, W, n_v).
 

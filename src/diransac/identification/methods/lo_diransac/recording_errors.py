@@ -17,11 +17,11 @@ from diransac.arrays import BoolArray
 from diransac.identification.core.columns import Columns, changes_by, recorrected, scores_tested, signal_rates
 from diransac.identification.core.equations import JointEquations, linearize
 from diransac.identification.core.fit import weights_of
-from diransac.identification.core.theta import ErrorKind, is_possible, largest_size
+from diransac.identification.core.theta import EffectKind, is_possible, largest_size
 
 if TYPE_CHECKING:
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
 
 LEAST_DELAY = 0.1
 """Delay, samples, from which on one is tried, and named."""
@@ -43,7 +43,7 @@ class RecordingError:
 
     Parameters
     ----------
-    kind : ErrorKind
+    kind : EffectKind
     size : float
         Its estimate: samples, the signal's unit, or relative to the gain.
     std : float
@@ -52,7 +52,7 @@ class RecordingError:
         Evidence that it would gain, nats, if the residuals were white.
     """
 
-    kind: ErrorKind
+    kind: EffectKind
     size: float
     std: float
     gain: float
@@ -63,9 +63,7 @@ class RecordingError:
         return abs(self.size) / self.std
 
 
-def clear_errors(
-    intervals: ShootingIntervals, fit: Fit, tested: Sequence[ErrorKind], *, worth: float
-) -> list[RecordingError]:
+def clear_errors(intervals: Windows, fit: Fit, tested: Sequence[EffectKind], *, worth: float) -> list[RecordingError]:
     """Errors that the residuals show most clearly: of a single signal, some of groups of signals, and of inputs.
 
     Groups that are late alike show nearly as clearly as others that are early, and a delay of inputs nearly as a lag;
@@ -74,10 +72,10 @@ def clear_errors(
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum.
-    tested : sequence of ErrorKind
+    tested : sequence of EffectKind
     worth : float
         Evidence that an error of a group, or of inputs, must promise, nats.
 
@@ -103,17 +101,15 @@ def clear_errors(
     return [*single[:1], *groups[:_GROUPS], *likeliest.values()]
 
 
-def errors_tested(
-    intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind], at_a_time: int
-) -> list[RecordingError]:
+def errors_tested(intervals: Windows, fit: Fit, kinds: Sequence[EffectKind], at_a_time: int) -> list[RecordingError]:
     """Estimates of errors one by one, given all else that is estimated.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum.
-    kinds : sequence of ErrorKind
+    kinds : sequence of EffectKind
     at_a_time : int
         Number of errors whose sensitivities, of a number for every sample, are held at a time.
     """
@@ -137,15 +133,15 @@ def errors_tested(
     return errors
 
 
-def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]) -> list[RecordingError]:
+def errors_of(intervals: Windows, fit: Fit, kinds: Sequence[EffectKind]) -> list[RecordingError]:
     """Remainders of some errors, estimated together, clear or not.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         At its optimum.
-    kinds : sequence of ErrorKind
+    kinds : sequence of EffectKind
 
     Returns
     -------
@@ -159,24 +155,24 @@ def errors_of(intervals: ShootingIntervals, fit: Fit, kinds: Sequence[ErrorKind]
     return [x for x in found if is_possible(intervals, x.kind, x.size)]
 
 
-def with_errors(intervals: ShootingIntervals, fit: Fit, errors: Sequence[RecordingError]) -> ShootingIntervals:
+def with_errors(intervals: Windows, fit: Fit, errors: Sequence[RecordingError]) -> Windows:
     """The intervals with measurements that are corrected of errors, too.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
         Of which the rates of signals are taken.
     errors : sequence of RecordingError
 
     Returns
     -------
-    ShootingIntervals
+    Windows
     """
     return intervals.corrected({x.kind: x.size for x in errors}, signal_rates(intervals, fit))
 
 
-def errors_of_signals(intervals: ShootingIntervals, among: BoolArray) -> list[ErrorKind]:
+def errors_of_signals(intervals: Windows, among: BoolArray) -> list[EffectKind]:
     """Errors that signals may have: delays and biases of single ones, and delays of groups.
 
     A group are the coordinates, the velocities, ..., or those of one unit, as one instrument measures them.  The bias
@@ -184,13 +180,13 @@ def errors_of_signals(intervals: ShootingIntervals, among: BoolArray) -> list[Er
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     among : (n_s,) bool array
         Single signals.
 
     Returns
     -------
-    list of ErrorKind
+    list of EffectKind
     """
     model = intervals.model
     seen = intervals.known.sum(axis=0) >= _FEWEST
@@ -203,27 +199,27 @@ def errors_of_signals(intervals: ShootingIntervals, among: BoolArray) -> list[Er
     groups = [mask & seen for mask in masks]
     late = [x for x in (*groups, *single) if x.any() and not (x == seen).all()]
     biased = np.array([n in model.biased_sensors for n in model.signals])
-    kinds = [ErrorKind(_places(x), "delay") for x in late]
-    return list(dict.fromkeys([*kinds, *(ErrorKind(_places(x), "bias") for x in single if not biased[x].any())]))
+    kinds = [EffectKind(_places(x), "delay") for x in late]
+    return list(dict.fromkeys([*kinds, *(EffectKind(_places(x), "bias") for x in single if not biased[x].any())]))
 
 
-def errors_of_inputs(intervals: ShootingIntervals) -> list[ErrorKind]:
+def errors_of_inputs(intervals: Windows) -> list[EffectKind]:
     """Errors that inputs may have: delays, lags and drifts of the gain, of all, of those of one unit, and of each.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
-    list of ErrorKind
+    list of EffectKind
     """
     model = intervals.model
     unit = np.array(list(model.inputs.values()))
     moving = np.ptp(intervals.inputs, axis=0) > 0.0
     masks = [moving, *(moving & (unit == u) for u in dict.fromkeys(unit.tolist())), *np.eye(len(unit), dtype=bool)]
     some = [x for x in masks if (x & moving).any()]
-    return list(dict.fromkeys(ErrorKind(_places(x), what, of_inputs=True) for what in _OF_INPUTS for x in some))
+    return list(dict.fromkeys(EffectKind(_places(x), what, of_inputs=True) for what in _OF_INPUTS for x in some))
 
 
 def _places(mask: BoolArray) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.estimate import Competition
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.local_search import Explanation
@@ -112,7 +112,7 @@ class Searched:
         delays = errors.input_delay - common * (abs(common) < LEAST_DELAY and not forced)
         return InputTiming.of(delays * dt, errors.input_lag * dt, errors.gain_drift)
 
-    def corrected(self, intervals: ShootingIntervals) -> ShootingIntervals:
+    def corrected(self, intervals: Windows) -> Windows:
         """Intervals of the same logs, corrected of the errors of sensors of the explanation."""
         own = self.likeliest.intervals
         sizes = {kind: x for kind, x in own.all_errors.sizes.items() if not kind.of_inputs}
@@ -157,7 +157,7 @@ def likeliest(
     dataset: Dataset,
     seed: int,
     callback: Callback | None,
-    whole: tuple[ShootingIntervals, Motion, tuple[str, ...]],
+    whole: tuple[Windows, Motion, tuple[str, ...]],
 ) -> Searched:
     """The likeliest explanation of the logs.
 
@@ -195,7 +195,7 @@ def likeliest(
 
 def searched(
     settings: LoDiransacSettings,
-    intervals: ShootingIntervals,
+    intervals: Windows,
     motion: Motion,
     notes: tuple[str, ...],
     seed: int,
@@ -236,7 +236,7 @@ def parameters_of(likeliest: Explanation) -> tuple[ProjectedEstimate, tuple[str,
     return (fitted_parameters(intervals, fit) if impossible else result), impossible
 
 
-def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -> Motion:
+def _completed(intervals: Windows, motion: Motion, dataset: Dataset) -> Motion:
     """The motion with its unmeasured states.  Raises IdentificationError: no simulation gives them."""
     found = with_unmeasured_states(intervals, motion)
     if found is None:
@@ -249,7 +249,7 @@ def _completed(intervals: ShootingIntervals, motion: Motion, dataset: Dataset) -
 
 
 def _hypotheses(
-    settings: LoDiransacSettings, intervals: ShootingIntervals, motion: Motion, seed: int, dataset: Dataset
+    settings: LoDiransacSettings, intervals: Windows, motion: Motion, seed: int, dataset: Dataset
 ) -> FloatArray:
     """Hypotheses, best first.  Raises IdentificationError: there are none, and the message names the cause."""
     found = find_hypotheses(settings, intervals, motion, seed, dataset)
@@ -259,7 +259,7 @@ def _hypotheses(
     raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
 
 
-def rows_of_logs(intervals: ShootingIntervals, motion: Motion) -> list[MotionRows]:
+def rows_of_logs(intervals: Windows, motion: Motion) -> list[MotionRows]:
     """Rows of the smoothed motion of each log."""
     logged = [np.arange(x.start, x.stop)[intervals.is_logged[x]] for x in intervals.rows_of_logs]
     parts = [motion.parts(intervals.model, rows) for rows in logged]

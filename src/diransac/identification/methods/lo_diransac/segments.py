@@ -22,7 +22,7 @@ from diransac.identification.regression.multistart import least_squares
 from diransac.simulation import Measurements, RolloutBatch, rollouts
 
 if TYPE_CHECKING:
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.smoothing import Motion
     from diransac.simulation import GaussNewtonBatch, Simulator
 
@@ -62,14 +62,14 @@ class ActingInputs:
         """True if no other has the same values, held alike."""
         return not any(self.hold == x.hold and np.array_equal(self.values, x.values) for x in others)
 
-    def shifted(self, intervals: ShootingIntervals, rows: int) -> ActingInputs:
+    def shifted(self, intervals: Windows, rows: int) -> ActingInputs:
         """Inputs that act some rows later, or earlier; those at the ends of a log are held."""
         every = np.arange(len(self.values))
         at = [np.clip(every[x] - rows, x.start, x.stop - 1) for x in intervals.rows_of_logs]
         return replace(self, values=self.values[np.concatenate(at)])
 
     @classmethod
-    def recorded(cls, intervals: ShootingIntervals, hold: str) -> ActingInputs:
+    def recorded(cls, intervals: Windows, hold: str) -> ActingInputs:
         """Inputs that act as they were recorded."""
         return cls(intervals.recorded, hold, InputTiming())
 
@@ -80,7 +80,7 @@ class Segments:
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
         Logs, model and sub-steps; its own division is not used.
     acting : ActingInputs
     starts : (K,) int array
@@ -89,7 +89,7 @@ class Segments:
         Rows of a segment.
     """
 
-    intervals: ShootingIntervals
+    intervals: Windows
     acting: ActingInputs
     starts: IntArray
     n_rows: int
@@ -242,12 +242,12 @@ class _States:
         return cost, found.gradient + away / self.spread, matrix
 
 
-def stretches(intervals: ShootingIntervals) -> list[slice]:
+def stretches(intervals: Windows) -> list[slice]:
     """Rows of the logs between gaps.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
@@ -261,24 +261,24 @@ def stretches(intervals: ShootingIntervals) -> list[slice]:
     return [slice(a, b + 1) for a, b in zip(np.flatnonzero(begins), np.flatnonzero(ends), strict=True)]
 
 
-def whole_stretches(intervals: ShootingIntervals) -> list[slice]:
+def whole_stretches(intervals: Windows) -> list[slice]:
     """Stretches that are at least half as long as the longest: whole logs, but for pieces between gaps.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     """
     parts = stretches(intervals)
     longest = max((x.stop - x.start for x in parts), default=0)
     return [x for x in parts if 2 * (x.stop - x.start) >= longest]
 
 
-def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
+def inlying_samples(intervals: Windows, motion: Motion) -> BoolArray:
     """Mask ``(N, n_signals)`` of the samples that are not far from a smoothed motion, in units of what it leaves.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
 
     Returns
@@ -291,7 +291,7 @@ def inlying_samples(intervals: ShootingIntervals, motion: Motion) -> BoolArray:
 
 
 def prior_states(
-    intervals: ShootingIntervals, motion: Motion, inlying: BoolArray, rows: IntArray
+    intervals: Windows, motion: Motion, inlying: BoolArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Means ``(K, n_x)`` and standard deviations ``(n_x,)`` of states before their segments are known.
 
@@ -300,7 +300,7 @@ def prior_states(
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
     inlying : (N, n_signals) bool array
         Samples that are no outliers.

@@ -42,7 +42,7 @@ from diransac.identification.structure.equivalents import is_close
 
 if TYPE_CHECKING:
     from diransac.arrays import IntArray
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
 _SHORTEST = 8
@@ -72,7 +72,7 @@ _TINY = 1e-150
 
 
 def simulation_error_candidates(
-    intervals: ShootingIntervals,
+    intervals: Windows,
     motion: Motion,
     starts: FloatArray,
     actings: Sequence[ActingInputs],
@@ -85,7 +85,7 @@ def simulation_error_candidates(
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         From which states start that nothing measures.
     starts : (m, n) array
@@ -123,7 +123,7 @@ def simulation_error_candidates(
 
 
 def explains_as_well(
-    intervals: ShootingIntervals,
+    intervals: Windows,
     motion: Motion,
     acting: ActingInputs,
     parameters: FloatArray,
@@ -138,7 +138,7 @@ def explains_as_well(
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         From which states start that nothing measures.
     acting : ActingInputs
@@ -158,7 +158,7 @@ def explains_as_well(
     return found.loss < own.loss + worse and not is_close(found.parameters, own.parameters).all()
 
 
-def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
+def _lengths(intervals: Windows, blocks: Blocks) -> list[int]:
     """Rows of the segments: those of a block, a third of them, and so on, the shortest first."""
     block = int(intervals.counted.sum()) // (1 + np.count_nonzero(np.diff(blocks.of_row)))
     longest = int(np.clip(block, 1, max((int(x.stop - x.start) for x in stretches(intervals)), default=1)))
@@ -166,7 +166,7 @@ def _lengths(intervals: ShootingIntervals, blocks: Blocks) -> list[int]:
     return [max(_SHORTEST, longest // _GROWTH**k) for k in range(n, -1, -1)]
 
 
-def _whole_lengths(intervals: ShootingIntervals, block: int) -> list[int]:
+def _whole_lengths(intervals: Windows, block: int) -> list[int]:
     """Rows of longer segments than a block: three times as many, and those of whole logs."""
     whole = min((x.stop - x.start for x in whole_stretches(intervals)), default=0)
     return [x for x in (_GROWTH * block, whole) if block < x <= min(whole, _MOST_ROWS)]
@@ -208,7 +208,7 @@ def estimates_of_logs(one: Candidate, motion: Motion, n_rows: int, *, outliers: 
     return found
 
 
-def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -> FloatArray:
+def _random_starts(intervals: Windows, known: FloatArray, seed: int) -> FloatArray:
     """Parameters within a decade of known ones, log-uniform; within the bounds where both are given."""
     bounds = intervals.layout.bounds
     lower, upper = np.array([[x.lower, x.upper] for x in bounds]).T
@@ -221,7 +221,7 @@ def _random_starts(intervals: ShootingIntervals, known: FloatArray, seed: int) -
     return np.array(found)
 
 
-def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, most_rows: int) -> Segments:
+def _segments(intervals: Windows, acting: ActingInputs, length: int, most_rows: int) -> Segments:
     """Segments one after another in all stretches; every k-th one where there are too many rows."""
     parts = [np.arange(x.start, x.stop - length + 1, length) for x in stretches(intervals)]
     starts = np.concatenate([np.arange(0), *parts])
@@ -229,7 +229,7 @@ def _segments(intervals: ShootingIntervals, acting: ActingInputs, length: int, m
 
 
 def _from_starts(
-    intervals: ShootingIntervals,
+    intervals: Windows,
     motion: Motion,
     starts: FloatArray,
     acting: ActingInputs,
@@ -291,14 +291,14 @@ class _Solution:
     segments : Segments
     motion : Motion
         Smoothed.
-    windows : ShootingIntervals
+    windows : Windows
         The segments.
     fit : Fit
     """
 
     segments: Segments
     motion: Motion
-    windows: ShootingIntervals
+    windows: Windows
     fit: Fit
 
     @classmethod
@@ -439,7 +439,7 @@ class _Solution:
         return replace(self.motion, signals=signals)
 
 
-def _windows(segments: Segments) -> ShootingIntervals:
+def _windows(segments: Segments) -> Windows:
     """The segments as windows that nothing ties."""
     acting = segments.acting
     return segments.intervals.parts_apart(acting.values, acting.hold, segments.starts, segments.n_rows)

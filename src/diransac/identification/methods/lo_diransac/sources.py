@@ -20,7 +20,7 @@ from diransac.time_limit import check_time
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.identification.methods.lo_diransac.smoothing import Motion
 
@@ -45,7 +45,7 @@ class Blocks:
     n: int
 
     @classmethod
-    def of(cls, intervals: ShootingIntervals, *, each: bool = False) -> Blocks:
+    def of(cls, intervals: Windows, *, each: bool = False) -> Blocks:
         """Blocks of the rows that count, as one log; of each log if asked, or where logs have own parameters."""
         found = np.zeros(len(intervals.is_logged), int)
         parts = intervals.rows_of_logs if each or not intervals.layout.is_shared else [slice(None)]
@@ -67,7 +67,7 @@ class Candidate:
     without : (n_blocks, n) array
     acting : ActingInputs
         Inputs with which it was estimated.
-    intervals : ShootingIntervals
+    intervals : Windows
         The logs, corrected of the errors of their sensors with which it was estimated.
     estimate : callable, optional
         The estimate with its covariance; None: no fit gave it, and its covariance is that of the jackknife over blocks.
@@ -79,7 +79,7 @@ class Candidate:
     parameters: FloatArray
     without: FloatArray
     acting: ActingInputs
-    intervals: ShootingIntervals
+    intervals: Windows
     estimate: Callable[[], ProjectedEstimate] | None = None
     motion: Motion | None = None
 
@@ -103,7 +103,7 @@ def jackknife(without: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------- least squares of all rows
 
 
-def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blocks: Blocks) -> Iterator[Candidate]:
+def least_squares_candidates(dataset: Dataset, intervals: Windows, blocks: Blocks) -> Iterator[Candidate]:
     """Estimates of the methods `ols` and `nls`: of signals as recorded where all are measured, else as filtered.
 
     Those that the logs determine and the bounds admit.
@@ -130,7 +130,7 @@ def least_squares_candidates(dataset: Dataset, intervals: ShootingIntervals, blo
                 yield Candidate(name, p, without, ActingInputs.recorded(intervals, dataset.hold), intervals)
 
 
-def _blocks_of_rows(own: Dataset, dataset: Dataset, intervals: ShootingIntervals, blocks: Blocks) -> IntArray:
+def _blocks_of_rows(own: Dataset, dataset: Dataset, intervals: Windows, blocks: Blocks) -> IntArray:
     """Block of each usable row of prepared logs."""
     places = []
     for one, given, rows in zip(own.segments, dataset.segments, intervals.rows_of_logs, strict=True):

@@ -34,7 +34,7 @@ from diransac.identification.methods.lo_diransac.interval_effects import batch_s
 if TYPE_CHECKING:
     from diransac.identification.core.equations import NormalEquations
     from diransac.identification.core.fit import Fit
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.methods.lo_diransac.projection import ProjectedEstimate
     from diransac.simulation import GaussNewtonBatch
 
@@ -161,7 +161,7 @@ class TermRegression:
         return -float((along * self.residuals).sum()), np.einsum("wm,wmk->k", along, self.columns)
 
 
-def parts_of_intervals(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> int:
+def parts_of_intervals(intervals: Windows, fit: Fit, n_terms: int) -> int:
     """Parts of each interval over which terms are constant: samples, if the regression then fits into the memory.
 
     Terms change with each reversal, within intervals over which the unmodelled acceleration is constant: a mean would
@@ -172,7 +172,7 @@ def parts_of_intervals(intervals: ShootingIntervals, fit: Fit, n_terms: int) -> 
 
 
 def term_regression(
-    intervals: ShootingIntervals,
+    intervals: Windows,
     fit: Fit,
     result: ProjectedEstimate,
     accelerations: FloatArray,
@@ -184,7 +184,7 @@ def term_regression(
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     fit : Fit
     result : ProjectedEstimate
         Of a fit whose intervals were split.
@@ -233,7 +233,7 @@ def term_regression(
 class _Pushed:
     """A fit that accelerations (W, n_v, K) of K terms push, and its normal equations."""
 
-    intervals: ShootingIntervals
+    intervals: Windows
     fit: Fit
     accelerations: FloatArray
     at: NormalEquations

@@ -22,7 +22,7 @@ from diransac.identification.regression.uncertainty import CLEAR
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.regression.observers import ObserverFit
     from diransac.model import Model
 
@@ -33,14 +33,14 @@ OBSERVED = ((1.5, 60, 64), (0.75, 20, 32), (0.375, 20, 12))
 """Stages of observers that follow the samples, which become simulations."""
 
 
-def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
+def unmeasured_states(intervals: Windows) -> tuple[str, ...]:
     """Names of the states of which no signal, and no derivative of one, is measured.
 
     Velocities of a model with kinematics follow from the measured coordinates whose rates depend on them.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
@@ -50,12 +50,12 @@ def unmeasured_states(intervals: ShootingIntervals) -> tuple[str, ...]:
     return _states_without(intervals.model, measured_signals(intervals))
 
 
-def measured_velocities(intervals: ShootingIntervals) -> BoolArray:
+def measured_velocities(intervals: Windows) -> BoolArray:
     """Velocities that signals, derivatives of them, or sensors measure.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
@@ -86,12 +86,12 @@ def _velocities_behind(model: Model, coordinates: tuple[str, ...]) -> set[str]:
     return {n for n, d in zip(model.velocities, depends, strict=True) if d}
 
 
-def unmeasured_by_name(intervals: ShootingIntervals) -> str:
+def unmeasured_by_name(intervals: Windows) -> str:
     """Unmeasured states in words: those of which the others are derivatives.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
@@ -102,12 +102,12 @@ def unmeasured_by_name(intervals: ShootingIntervals) -> str:
     return ", ".join(chain[0] for chain in intervals.model.chains if chain[0] in lost)
 
 
-def measured_signals(intervals: ShootingIntervals) -> tuple[str, ...]:
+def measured_signals(intervals: Windows) -> tuple[str, ...]:
     """Names of the signals with a sample.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
 
     Returns
     -------
@@ -118,12 +118,12 @@ def measured_signals(intervals: ShootingIntervals) -> tuple[str, ...]:
     return tuple(intervals.model.signals[i] for i in seen)
 
 
-def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
+def with_unmeasured_states(intervals: Windows, motion: Motion) -> Motion | None:
     """The motion with trajectories of the unmeasured states and of their derivatives.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
 
@@ -135,12 +135,12 @@ def with_unmeasured_states(intervals: ShootingIntervals, motion: Motion) -> Moti
     return _best(intervals, motion, _driven(intervals, motion), DRIVEN)
 
 
-def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion | None:
+def with_observed_states(intervals: Windows, motion: Motion) -> Motion | None:
     """The motion of observers that follow the samples, of measured states and of others.
 
     Parameters
     ----------
-    intervals : ShootingIntervals
+    intervals : Windows
     motion : Motion
         Smoothed motion over the rows of the intervals.
 
@@ -152,7 +152,7 @@ def with_observed_states(intervals: ShootingIntervals, motion: Motion) -> Motion
     return _best(intervals, motion, _observers(intervals, motion), OBSERVED)
 
 
-def _driven(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
+def _driven(intervals: Windows, motion: Motion) -> ObserverFit:
     """Least squares in units of the spread of the sensors, and of the accelerations as the observers filter them."""
     from diransac.identification.regression.observers import driven_states
 
@@ -178,7 +178,7 @@ def _driven(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
     )
 
 
-def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
+def _observers(intervals: Windows, motion: Motion) -> ObserverFit:
     """Observers of all states, in units of the noise of the samples.
 
     Outliers, and what is missing, take the smoothed motion as samples, without weight.  So do velocities that
@@ -207,7 +207,7 @@ def _observers(intervals: ShootingIntervals, motion: Motion) -> ObserverFit:
 
 
 def _best(
-    intervals: ShootingIntervals, motion: Motion, problem: ObserverFit, stages: Sequence[tuple[float, int, int]]
+    intervals: Windows, motion: Motion, problem: ObserverFit, stages: Sequence[tuple[float, int, int]]
 ) -> Motion | None:
     """The motion whose parameters simulate the intervals best, of those to which stages lead."""
     fit, z = problem.search([(width / intervals.duration, n_steps, n_kept) for width, n_steps, n_kept in stages])

@@ -27,7 +27,7 @@ from diransac.identification.regression.uncertainty import CLEAR
 
 if TYPE_CHECKING:
     from diransac.data.dataset import Dataset
-    from diransac.identification.core.windows import ShootingIntervals
+    from diransac.identification.core.windows import Windows
     from diransac.identification.method import Callback
     from diransac.identification.methods.lo_diransac.settings import LoDiransacSettings
 
@@ -167,7 +167,7 @@ def followed(
     return Followed(last.trajectories(parameters, now.states), last.noise.sigma, outliers, intervals.length)
 
 
-def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[ShootingIntervals, tuple[str, ...]]:
+def _intervals(settings: LoDiransacSettings, dataset: Dataset) -> tuple[Windows, tuple[str, ...]]:
     """Intervals of the logs, and findings of the screening.  Raises LogError: the logs are too short."""
     samples, notes = screened(dataset)
     length = int(np.clip(round(settings.smoothing_half_width / dataset.dt), 5, 25))
