@@ -153,11 +153,6 @@ class Diagnosis:
             **series,
         )
 
-    def first_states(self, log: int) -> dict[str, float]:
-        """Most probable state at the first row of one log, by name."""
-        first = self.windows_of(log)[0]
-        return {name: float(values[first]) for name, values in self.smoothed_states.items()}
-
     def unidentifiable_sentences(self) -> tuple[str, ...]:
         """Sentences about the parameters that are not identifiable, without stops; empty where there is none."""
         each = (f"{name} is not identifiable from this log; excite it" for name in self.unidentifiable)

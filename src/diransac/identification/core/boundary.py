@@ -60,14 +60,6 @@ class BoundaryPrior:
         roots, columns = np.sqrt(values[kept]), vectors[:, kept]
         return cls(point, (columns * roots).T / scale, columns.T @ (scale * right) / roots)
 
-    @classmethod
-    def of_covariance(cls, mean: FloatArray, covariance: FloatArray) -> BoundaryPrior:
-        """The Gaussian with a mean ``(n,)`` and a covariance ``(n, n)``."""
-        scale = np.sqrt(np.diag(covariance))
-        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-        roots = 1.0 / np.sqrt(np.maximum(values, _ROUNDING))
-        return cls(mean, (vectors * roots).T / scale, np.zeros(len(mean)))
-
     @property
     def information(self) -> FloatArray:
         """Information matrix ``(n, n)``."""

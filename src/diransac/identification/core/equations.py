@@ -177,14 +177,14 @@ def linearize(
     F = sums.final_slopes[:-1]
     linked = intervals.linked
     jumps = fit.jumps(intervals)
-    np.einsum("wii->wi", H)[:, :n_x] += fit.x_std**-2.0
-    g[:, :n_x] -= (fit.x - fit.x_mean) * fit.x_std**-2.0
     F = F if linked.all() else np.where(linked[:, None, None], F, 0.0)
     precision = linked[:, None] / np.square(fit.continuity_std)
     FP = F.swapaxes(1, 2) * precision[:, None, :]
     H[:-1] += FP @ F
     g[:-1] += np.einsum("wij,wj->wi", FP, jumps)
-    own_diagonal = np.einsum("wii->wi", H)
+    own_diagonal, of_states = np.einsum("wii->wi", H), fit.x_std**-2.0
+    own_diagonal[:, :n_x] += of_states
+    g[:, :n_x] -= (fit.x - fit.x_mean) * of_states
     own_diagonal[1:, :n_x] += precision
     H[1:, :n_x, k:] -= precision[:, :, None] * F[:, :, k:]
     g[1:, :n_x] -= precision * jumps

@@ -1,7 +1,8 @@
 """The one vector of shared unknowns: parameters of all logs, discrepancies, and errors of recordings ("effects").
 
 An effect is a systematic error of a sensor or an input: a delay, a lag, a bias, a drift of a gain.  Like a parameter,
-it has a name, bounds and a Gaussian prior; one that is off is not among the unknowns.  A per-log parameter has a place
+it has a name, bounds and a Gaussian prior, which is so wide that cost and evidence leave it out: it decides where a log
+does not.  An effect that is off is not among the unknowns.  A per-log parameter has a place
 of each log in the vector, and windows touch the places of their own log alone.
 """
 

@@ -286,7 +286,7 @@ class _Maker:
 
     @cached_property
     def value(self) -> Callable[[str], ca.SX]:
-        """What a term's code computes from the model's signals; 1 without code."""
+        """Value of a term from the model's signals, as its code computes it; 1 without code."""
         signals = {"ca": ca, **dict(zip("qvau", self.model.named(*self.symbols[:4]), strict=True))}
         return cache(lambda code: ca.SX(eval(code or "1", signals)))
 

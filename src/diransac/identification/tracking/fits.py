@@ -109,7 +109,7 @@ def is_surprised(intervals: Windows, fit: Fit) -> bool:
 
 
 def left_by(intervals: Windows, fit: Fit, weights: FloatArray | None = None) -> BoundaryPrior:
-    """What all intervals but the last tell of the unknowns where that begins, linearised at a fit.
+    """Boundary prior that all intervals but the last leave where that begins, linearised at a fit.
 
     Parameters
     ----------

@@ -244,7 +244,7 @@ def stepped(window: Window, start: Fit, first: int, changed: IntArray, sizes: Fl
 
 
 def _before(window: Window, start: Fit, first: int) -> tuple[BoundaryPrior, float]:
-    """What the intervals before one leave, and their evidence, nats."""
+    """Boundary prior that the intervals before one leave, and their evidence, nats."""
     if not first:
         assert start.boundary is not None
         return start.boundary, 0.0

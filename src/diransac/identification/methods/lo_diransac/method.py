@@ -1,9 +1,9 @@
 """The steps of lo-diransac in their order.
 
-1. `smoothing`: screening of samples; the motion without a model.
+1. `preparation`, `smoothing`: logs in windows; the motion without a model.
 2. `hypotheses`: parameters from random samples of the equations in weak form, scored by simulation.
-3. `refinement`: the most probable motion and parameters, noise and discrepancies, from the best of them.
-4. `projection`: parameters of the whole motion, and their covariance.
+3. `local_search`: the most probable motion and parameters, noise and discrepancies, from the best of them (`core`).
+4. `projection`, `competition`: parameters of the whole motion; the estimate that predicts best.
 """
 
 from __future__ import annotations
@@ -200,11 +200,7 @@ def configured(settings: Settings, **options: Any) -> LoDiransac:
 
 def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callback | None) -> Estimate:
     """Parameters of the dataset's model, step by step."""
-    _check_sensors(settings, dataset)
-    unknown = [name for name in settings.start or () if name not in dataset.model.parameters]
-    if unknown:
-        has = ", ".join(dataset.model.parameters)
-        raise SettingsError(f'start names "{unknown[0]}", which is not to be identified; these are: {has}')
+    _check_names(settings, dataset)
     allowed = len(dataset.model.parameters) - 1
     check_structure(dataset.model, dataset.source, allowed, ranges=dataset.ranges)
     report(callback, "smoothing", 0.0)
@@ -244,8 +240,12 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     return replace(_estimate(settings, found, end, checks), disagreements=parts.disagreements)
 
 
-def _check_sensors(settings: LoDiransacSettings, dataset: Dataset) -> None:
-    """Raises SettingsError: a signal or an input is named that the logs lack."""
+def _check_names(settings: LoDiransacSettings, dataset: Dataset) -> None:
+    """Raises SettingsError: a signal or an input is named that the logs lack, or a parameter that is not sought."""
+    unknown = [name for name in settings.start or () if name not in dataset.model.parameters]
+    if unknown:
+        has = ", ".join(dataset.model.parameters)
+        raise SettingsError(f'start names "{unknown[0]}", which is not to be identified; these are: {has}')
     inputs = tuple(dataset.model.inputs)
     known = {"sensor_delays": (*dataset.signals, *inputs), "sensor_biases": dataset.signals, "gain_drifts": inputs}
     for setting, names in known.items():

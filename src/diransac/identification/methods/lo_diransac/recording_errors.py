@@ -2,7 +2,7 @@
 
 A sensor is here whatever measures a signal, with a measurement equation or without.  A score test finds the most
 significant error, given all else that is estimated; it costs a call of the simulator, and no fit.  From then on the
-error is an unknown of the fit as others (`joint_equations`).
+error is an unknown of the fit as others (`core/equations.py`).
 """
 
 from __future__ import annotations
