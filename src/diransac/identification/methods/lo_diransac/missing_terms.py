@@ -431,7 +431,9 @@ def _inertia_slopes(intervals: Windows, drawn: Sequence[FloatArray]) -> FloatArr
     """Slopes ``(n,)`` of the logarithm of the logs' mean inertia by the parameters of all logs."""
     (q, v, _, u, p), places = drawn, intervals.layout.index
     slopes: FloatArray = np.zeros(intervals.n_p)
-    np.add.at(slopes, places, inertia_slopes(intervals.model, q, v, u, p) / len(places))
+    of_model = inertia_slopes(intervals.model, q, v, u, p) / len(places)
+    for own in places:
+        slopes[own] += of_model
     return slopes
 
 
