@@ -93,7 +93,8 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
     compiled_of(label, spec)
-    return str(spec.to_xml()), drives
+    with without_warnings():
+        return str(spec.to_xml()), drives
 
 
 def compiled_of(label: str, source: Any) -> Any:
