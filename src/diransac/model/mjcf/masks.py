@@ -106,17 +106,17 @@ def _of_mask(label: str, compiled: Any, sensors: Collection[SensorColumns], mask
     indices = range(size) if parts["index"] is None else [int(parts["index"])]
     if indices[-1] >= size:
         raise ModelError(f"{said} has the index {indices[-1]}, but {name} has {size} entries")
-    absent = dict[int, str]()
+    reasons = list[str]()
     for index in indices:
-        entries = {k: x.numbers[index] for k, x in fields.items() if index < len(x.numbers)}
-        absent = {k: _absence(compiled, k, x) for k, x in entries.items()}
-        present = {k: x for k, x in entries.items() if not absent[k]}
+        held = {k: x.numbers[index] for k, x in fields.items() if index < len(x.numbers)}
+        reasons += [_absence(compiled, k, x) for k, x in held.items()]
+        present = {k: x for k, x in held.items() if not _absence(compiled, k, x)}
         for group in [{k: x} for k, x in present.items()] if each else [present] if present else []:
             named = names_of(compiled, kind)[next(iter(group))] if each else pattern
             at = f"[{index}]" if size > 1 else ""
             yield _unknown(compiled, kind, f"{kind}/{named}.{name}{at}", group)
-    if len(indices) == len(absent) == 1 and all(absent.values()):
-        raise ModelError(f"{said}: {next(iter(absent.values()))}")
+    if all(reasons):
+        raise ModelError(f"{said}: {reasons[0]}")
 
 
 def _fields(said: str, compiled: Any, kind: str, pattern: str, name: str) -> dict[int, Field]:
@@ -142,12 +142,12 @@ def _fields(said: str, compiled: Any, kind: str, pattern: str, name: str) -> dic
     raise ModelError(f'{said}: there is no {kind}.{name} of "{names[k]}", of the kind {its_kind}; {advice}')
 
 
-def _absence(compiled: Any, k: int, entry: Number) -> str:
-    """Reason why an entry of an element cannot be identified; empty where it can."""
-    if entry.instead:
-        return f"the compiled model has no such entry; give {entry.instead}"
-    if entry.switch is not None:
-        array, column = entry.switch
+def _absence(compiled: Any, k: int, number: Number) -> str:
+    """Reason why a number of an element cannot be identified; empty where it can."""
+    if number.instead:
+        return f"the compiled model has no such entry; give {number.instead}"
+    if number.switch is not None:
+        array, column = number.switch
         if not np.atleast_1d(getattr(compiled, array)[k])[column]:
             return "the file has 0 there, by which MuJoCo leaves it out; give it a first value in the file"
     return ""
@@ -155,12 +155,12 @@ def _absence(compiled: Any, k: int, entry: Number) -> str:
 
 def _unknown(compiled: Any, kind: str, name: str, group: Mapping[int, Number]) -> Unknown:
     """The parameter of some elements of a kind, an entry of a field of each."""
-    entry, places = next(iter(group.values())), [x for k, e in group.items() for x in places_of(compiled, kind, k, e)]
+    number, places = next(iter(group.values())), [x for k, n in group.items() for x in places_of(compiled, kind, k, n)]
     value = float(np.median([getattr(compiled, x.array)[x.index] / x.factor for x in places]))
     slides = kind == "joint" and all(compiled.jnt_type[k] == 2 for k in group)
-    unit = entry.of_slide if slides and entry.of_slide else entry.unit
-    nominal = None if entry.sign == "positive" and value <= 0.0 else value
-    bounds = {"lower": 0.0} if entry.sign == "non-negative" else {"positive": True} if entry.sign == "positive" else {}
+    unit = number.of_slide if slides and number.of_slide else number.unit
+    nominal = None if number.sign == "positive" and value <= 0.0 else value
+    bounds = {"lower": 0.0} if number.sign == "non-negative" else {"positive": True} if number.sign == "positive" else {}
     elements = tuple((kind, names_of(compiled, kind)[k]) for k in group)
     return Unknown(name, Parameter(unit, value=nominal, **bounds), tuple(places), elements)
 
