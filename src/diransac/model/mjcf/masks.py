@@ -160,7 +160,9 @@ def _unknown(compiled: Any, kind: str, name: str, group: Mapping[int, Number]) -
     slides = kind == "joint" and all(compiled.jnt_type[k] == 2 for k in group)
     unit = number.of_slide if slides and number.of_slide else number.unit
     nominal = None if number.sign == "positive" and value <= 0.0 else value
-    bounds = {"lower": 0.0} if number.sign == "non-negative" else {"positive": True} if number.sign == "positive" else {}
+    bounds = (
+        {"lower": 0.0} if number.sign == "non-negative" else {"positive": True} if number.sign == "positive" else {}
+    )
     elements = tuple((kind, names_of(compiled, kind)[k]) for k in group)
     return Unknown(name, Parameter(unit, value=nominal, **bounds), tuple(places), elements)
 

@@ -140,6 +140,15 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
     raise writer.refusal(off)
 
 
+def with_inertials(document: Document, compiled: Any) -> str:
+    """Text of a description with the inertials of its compiled model in it, if its compiler would change others."""
+    writer = _Writer(document, compiled)
+    if writer.release_inertials():
+        for k in writer.massive:
+            writer.write_inertial(k, compiled)
+    return document.text()
+
+
 class _Writer:
     """What is written into a text.
 
@@ -152,23 +161,23 @@ class _Writer:
     def __init__(self, document: Document, meant: Any) -> None:
         self.document, self.meant = document, meant
         self.names = {kind: names_of(meant, kind) for kind in (*FIELDS, "actuator")}
+        self.massive = [k for k in range(1, meant.nbody) if meant.body_mass[k] > 0.0]
         self.numbers = dict[tuple[str, int, str], list[FloatArray]]()  # so far, by kind, index and attribute
 
     def write(self, off: Collection[Entry], found: Any) -> None:
         """Write what differs, and take out what undoes it.  Raises ModelError: an element is not in the text."""
         bodies = sorted({at[0] for array, at in off if array in INERTIALS})
-        if any(("body", k, "inertial") in self.numbers for k in bodies) and self._release_inertials():
-            bodies = [k for k in range(1, self.meant.nbody) if self.meant.body_mass[k] > 0.0]
+        if any(("body", k, "inertial") in self.numbers for k in bodies) and self.release_inertials():
+            bodies = self.massive
         for k in bodies:
-            self._write_inertial(k, found)
+            self.write_inertial(k, found)
         for kind, k, own in self._elements(off):
             fields = self._fields(kind, k)
             chosen = [name for name, x in fields.items() if own & self._entries(kind, k, x)]
             if kind == "actuator" and not self._takes(k, own, [fields[name] for name in chosen]):
                 self._write_general(k)
                 continue
-            for name in chosen:
-                self._write_field(kind, k, name, found)
+            self._write_fields(kind, k, chosen, found)
 
     def refusal(self, off: Mapping[Entry, tuple[float, float]]) -> ModelError:
         """Error that names the first difference, of what is written if there is one."""
@@ -216,24 +225,24 @@ class _Writer:
 
     # ------------------------------------------------------------------ attributes
 
-    def _write_field(self, kind: str, k: int, name: str, found: Any) -> None:
-        """Write an attribute, and with it those that stand in place of the same other one."""
-        element, fields, names = self._element(kind, k), self._fields(kind, k), [name]
-        other = fields[name].replaces
-        if other in element.attributes or (other == "springdamper" and other.encode() in self.document.source):
-            element.changes[other] = "0 0" if other == "springdamper" else None  # a class may have it
-            names = [n for n, x in fields.items() if x.replaces == other]
-        for each in names:
-            meant, compiled = (self._values(x, kind, k, fields[each]) for x in (self.meant, found))
-            new = self._next((kind, k, each), meant, compiled).tolist()
-            while len(new) > len(fields[each].numbers) and new[-1] == 0.0:
+    def _write_fields(self, kind: str, k: int, chosen: Collection[str], found: Any) -> None:
+        """Write attributes, and with them those that stand in place of the same other one."""
+        element, fields = self._element(kind, k), self._fields(kind, k)
+        for other in {fields[name].replaces for name in chosen} - {""}:
+            if other in element.attributes or (other == "springdamper" and other.encode() in self.document.source):
+                element.changes[other] = "0 0" if other == "springdamper" else None  # a class may have it
+                chosen = [n for n, x in fields.items() if n in chosen or x.replaces == other]
+        for name in chosen:
+            meant, compiled = (self._values(x, kind, k, fields[name]) for x in (self.meant, found))
+            new = self._next((kind, k, name), meant, compiled).tolist()
+            while len(new) > len(fields[name].numbers) and new[-1] == 0.0:
                 new.pop()
             if not self.document.is_urdf:
-                element.changes[each] = numbers(new)
-            elif each in _URDF:
-                element.child("dynamics").changes[_URDF[each]] = numbers(new)
+                element.changes[name] = numbers(new)
+            elif name in _URDF:
+                element.child("dynamics").changes[_URDF[name]] = numbers(new)
             else:
-                raise ModelError(f"{self.document.label} is a URDF, which has no place for {each} of a {kind}")
+                raise ModelError(f"{self.document.label} is a URDF, which has no place for {name} of a {kind}")
 
     def _values(self, compiled: Any, kind: str, k: int, field: Field) -> FloatArray:
         """Numbers of an attribute."""
@@ -255,7 +264,7 @@ class _Writer:
 
     # ------------------------------------------------------------------ inertials
 
-    def _write_inertial(self, k: int, found: Any) -> None:
+    def write_inertial(self, k: int, found: Any) -> None:
         """Write the inertial of a body."""
         element, meant = self._element("body", k), _inertial_numbers(self.meant, k)
         mass, centre, inertia = np.split(
@@ -269,7 +278,7 @@ class _Writer:
         texts |= {"mass": numbers(mass), "diaginertia": numbers(inertia)}
         element.child("inertial").replacement = f"<inertial {attributes(texts)}/>"
 
-    def _release_inertials(self) -> bool:
+    def release_inertials(self) -> bool:
         """Take out what changes inertials as they are compiled; return whether there was such a thing."""
         changes = dict[str, str | None].fromkeys(_OF_INERTIALS) | {"inertiafromgeom": "auto"}
         released = False
