@@ -96,8 +96,11 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
         _embed(mesh, compiled)
     compiled = compiled_of(label, spec)
     with without_warnings():
-        text = str(spec.to_xml())  # in which masses are as before they are bounded, or scaled to a total
-    return with_inertials(Document(text.encode(), label), compiled), drives
+        text = str(spec.to_xml())
+    own = spec.compiler
+    if own.settotalmass > 0.0 or own.boundmass or own.boundinertia or own.balanceinertia:  # which it is yet without
+        text = with_inertials(Document(text.encode(), label), compiled)
+    return text, drives
 
 
 def compiled_of(label: str, source: Any) -> Any:

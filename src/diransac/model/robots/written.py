@@ -31,8 +31,8 @@ from diransac.model.robots.fields import (
 
 _ROUNDS = 6
 """Compilations of the text; each undoes one more effect of the compiler, of which few act on one number."""
-_SAME = 1e-7
-"""Relative difference of what is the same: what MuJoCo derives has lost some of its digits."""
+_SAME = 1e-5
+"""Relative difference of what is the same: the principal axes that MuJoCo finds before version 4 have six digits."""
 _OF_INERTIALS = ("settotalmass", "boundmass", "boundinertia", "balanceinertia")
 """Attributes of the compiler that change inertials."""
 _URDF = {"damping": "damping", "frictionloss": "friction"}
@@ -79,6 +79,8 @@ def differences(meant: Any, found: Any) -> dict[Entry, tuple[float, float]]:
         if own.shape != other.shape:
             raise ValueError(f"{name} has the shape {other.shape} in place of {own.shape}")
         size = np.abs(own) + np.abs(other) + 1e-9 * np.abs(own).max(initial=0.0)
+        if name == "body_inertia":  # entries beside the diagonal are as exact as those on it
+            size = size.max(axis=1, keepdims=True)
         for at in np.argwhere(~((np.abs(own - other) <= _SAME * size) | (own == other))):
             index = tuple(at.tolist())
             off[name, index] = float(own[index]), float(other[index])
@@ -141,11 +143,11 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
 
 
 def with_inertials(document: Document, compiled: Any) -> str:
-    """Text of a description with the inertials of its compiled model in it, if its compiler would change others."""
+    """Text of a description with the inertials of its compiled model in it, which its compiler does not change."""
     writer = _Writer(document, compiled)
-    if writer.release_inertials():
-        for k in writer.massive:
-            writer.write_inertial(k, compiled)
+    writer.release_inertials()
+    for k in writer.massive:
+        writer.write_inertial(k, compiled)
     return document.text()
 
 
@@ -190,6 +192,8 @@ class _Writer:
 
     def _said(self, entry: Entry) -> str:
         """Field and element of an entry."""
+        if entry[0] in INERTIALS:
+            return f'{entry[0].removeprefix("body_")} of body "{self.names["body"][entry[1][0]] or entry[1][0]}"'
         for kind, k, _ in self._elements([entry]):
             fields = fields_of(self.meant, kind, k)
             name = next((n for n, x in fields.items() if entry in self._entries(kind, k, x)), entry[0])
