@@ -31,8 +31,9 @@ from diransac.model.robots.fields import (
 
 _ROUNDS = 6
 """Compilations of the text; each undoes one more effect of the compiler, of which few act on one number."""
-_SAME = 1e-5
-"""Relative difference of what is the same: the principal axes that MuJoCo finds before version 4 have six digits."""
+_SAME, _SAME_DERIVED = 1e-9, 1e-5
+"""Relative differences of what is the same: of what attributes hold; of what MuJoCo derives, such as principal axes, of
+which versions before 4 find six digits."""
 _OF_INERTIALS = ("settotalmass", "boundmass", "boundinertia", "balanceinertia")
 """Attributes of the compiler that change inertials."""
 _URDF = {"damping": "damping", "frictionloss": "friction"}
@@ -81,7 +82,8 @@ def differences(meant: Any, found: Any) -> dict[Entry, tuple[float, float]]:
         size = np.abs(own) + np.abs(other) + 1e-9 * np.abs(own).max(initial=0.0)
         if name == "body_inertia":  # entries beside the diagonal are as exact as those on it
             size = size.max(axis=1, keepdims=True)
-        for at in np.argwhere(~((np.abs(own - other) <= _SAME * size) | (own == other))):
+        same = _SAME if name in ARRAYS - {"body_inertia"} else _SAME_DERIVED
+        for at in np.argwhere(~((np.abs(own - other) <= same * size) | (own == other))):
             index = tuple(at.tolist())
             off[name, index] = float(own[index]), float(other[index])
     return off
