@@ -219,3 +219,12 @@ def test_a_pattern_names_those_actuators_that_have_the_field(tmp_path: Path):
     new, _ = calibrated_text(path, model, values, np.eye(3))
     assert '<position name="a" joint="j" kp="31.0" armature="0.002"/>' in new
     assert '<pid name="b" joint="j" kp="13.0" armature="0.002"/>' in new
+
+
+def test_an_actuator_of_another_kind_in_the_file_is_named(tmp_path: Path):
+    path = tmp_path / "a.xml"
+    path.write_text(text("pid", {"kp": "30", "ki": "2"}))
+    model = dr.models.mujoco(path, unknown=["actuator/a.ki"])
+    path.write_text(text("position", {"kp": "30"}))
+    with pytest.raises(ModelError, match='actuator "a" has no ki, as that of the model has'):
+        calibrated_text(path, model, {"actuator/a.ki": 3.0}, np.eye(1))

@@ -87,7 +87,12 @@ def _places(label: str, meant: Any, unknown: Unknown) -> list[Place]:
                 return []
             raise ModelError(f'{label} has no {kind} of the name "{name}"')
         k = names.index(name)
-        places += places_of(meant, kind, k, fields_of(meant, kind, k)[unknown.field].numbers[unknown.index])
+        field = fields_of(meant, kind, k).get(unknown.field)
+        if field is None or unknown.index >= len(field.numbers):
+            raise ModelError(
+                f'{label}: {kind} "{name}" has no {unknown.name.rpartition(".")[2]}, as that of the model has'
+            )
+        places += places_of(meant, kind, k, field.numbers[unknown.index])
     return places
 
 

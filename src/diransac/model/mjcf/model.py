@@ -52,8 +52,10 @@ def mujoco(
         parameter per mask: all that it matches have one value; with ``each:`` before it, one per match. Without index,
         one per entry of the field. Fields are those of MuJoCo's compiled model: ``body/trunk.mass``,
         ``body/payload.ipos[0]``, ``geom/*_foot.friction[0]``, ``joint/*.armature``, ``joint/*.damping``,
-        ``joint/*.frictionloss``, ``actuator/*.gainprm[0]``, ``actuator/*.dynprm[0]``, ``pair/...``; also
-        ``actuator/*.kp`` and ``.kv`` of position servos, and ``sensor/*.bias``. Nominal values are the file's.
+        ``joint/*.frictionloss``, ``pair/...``; also ``sensor/*.bias``. Actuators have the numerical attributes of their
+        kind, as the file names them: ``actuator/*.kp`` of ``position`` and ``pid``, ``actuator/*.lugre[2]`` of
+        ``dcmotor``; and ``gear``, ``armature``, ``damping``, ``gainprm``, ``biasprm``, ``dynprm``. Nominal values are
+        the file's.
     actuation : Actuation, optional
         Drives of hinges and slides in place of the file's actuators, of those joints that the file drives, or all:
         `PositionControl`, `JointTorques` or `MotorCurrents`. None: the file's actuators, whose controls are the inputs.

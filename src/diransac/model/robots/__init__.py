@@ -9,6 +9,8 @@ Begin with `robot.py`.
 | `description.py`, `sizes.py` | bodies and joints of a file, read by MuJoCo; limits of its size |
 | `rigid_body.py`, `mechanism.py`, `actuation.py` | inverse dynamics; forces of joints; forces of drives |
 | `calibration.py`, `consistency.py` | estimates in the file; possible bodies for base parameters |
+| `fields.py` | attributes of elements, and the entries of MuJoCo's compiled model that they hold |
+| `document.py`, `written.py` | the file's text; a text that MuJoCo compiles to a given model |
 """
 
 from diransac.model.robots.actuation import Actuation, JointTorques, MotorCurrents, PositionControl, drive_forces
