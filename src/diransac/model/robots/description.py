@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -47,7 +47,12 @@ class Joint:
     armature : float
         Inertia of the rotor behind the gear, kg m^2 or kg.
     damping, stiffness : tuple of float
-        Coefficients of ``d_0 v + d_1 |v| v + ...`` and of ``k_0 x + k_1 |x| x + ...``.
+        Coefficients of ``d_0 v + d_1 |v| v + d_2 v^3`` and of ``k_0 x + k_1 x^2 + k_2 x^3``: in MuJoCo, the polynomial
+        of damping alone is odd.
+    drive_armature, drive_damping : float
+        What the file's actuators have of the armature, and of the first coefficient of the damping.
+    compensated_by_drive : bool
+        Whether the drive's force has the gravity compensation of the bodies in it.
     friction : float
         Coulomb friction, N m or N.
     spring_reference : float
@@ -63,6 +68,9 @@ class Joint:
     reference: float
     armature: float
     damping: tuple[float, ...]
+    drive_armature: float
+    drive_damping: float
+    compensated_by_drive: bool
     friction: float
     stiffness: tuple[float, ...]
     spring_reference: float
@@ -133,6 +141,8 @@ class Description:
     couplings : tuple of Coupling
     gravity : (3,) array
         In the world frame, m/s^2.
+    compiled : mujoco.MjModel
+        MuJoCo's model of the same tree, without meshes.
     base : int, optional
         Index of a body whose motion is measured; by default no body of those on the world moves by itself.
     """
@@ -142,6 +152,7 @@ class Description:
     joints: tuple[Joint, ...]
     couplings: tuple[Coupling, ...]
     gravity: FloatArray
+    compiled: Any = field(compare=False, repr=False)
     base: int | None = None
 
 
@@ -201,8 +212,8 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
     Raises
     ------
     ModelError
-        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, a tendon
-        that exerts forces, or a surrounding fluid.
+        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, or springs
+        or constraints of other kinds than those of joints.
     """
     try:
         return _description(path, base)
@@ -212,11 +223,7 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
 
 def _description(path: str | Path, base: str | None) -> Description:
     """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
-    spec = parsed(path)
-    floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
-    names = [joint.parent.name for joint in floating]
-    for joint in floating:
-        spec.delete(joint)
+    label, spec = f'robot description "{path}"', parsed(path)
     drives = _drive_limits(spec)
     _drop_shapes(spec)
     try:
@@ -225,17 +232,46 @@ def _description(path: str | Path, base: str | None) -> Description:
             model = spec.compile()
     except _FAILURES as error:
         raise _unreadable(path, error) from error
-    label = f'robot description "{path}"'
-    _check_supported(label, model)
     if model.njnt > MOST_JOINTS:
         raise ModelError(f"{label}: it has {beyond(MOST_JOINTS, 'joints', model.njnt)}; split the robot")
-    joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
-    if not joints:
+    _check_supported(label, model, base)
+    found = described(label, model, drives, re.sub(r"\W+", "-", spec.modelname) or Path(path).stem)
+    if not found.joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
-    bodies = tuple(_body(model, i) for i in range(1, model.nbody))
-    name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
-    measured = _measured_base(label, bodies, names) if base == "measured" else None
-    return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+    return replace(found, base=_measured_base(label, found)) if base == "measured" else found
+
+
+def described(label: str, model: Any, drives: Mapping[str, tuple[float, float]], name: str) -> Description:
+    """Tree of a compiled model, in which free joints hold their bodies in the pose of the file.
+
+    Parameters
+    ----------
+    label : str
+        Of the file in messages.
+    model : mujoco.MjModel
+    drives : mapping of str to (float, float)
+        Range of the forces of a joint's drives, by its name.
+    name : str
+        Of the robot.
+
+    Raises
+    ------
+    ModelError
+        An equality constraint closes a loop.
+    """
+    bits, flags = mujoco_module().mjtDisableBit.__members__.values(), int(model.opt.disableflags)
+    without = {bit.name.removeprefix("mjDSBL_").lower() for bit in bits if flags & bit.value}
+    moved = moved_joints(model)
+    joints = tuple(_joint(model, k, drives, without) for k in moved)
+    bodies = tuple(_body(model, i, moved, without) for i in range(1, model.nbody))
+    couplings = () if without & {"constraint", "equality"} else tuple(_couplings(label, model, moved))
+    gravity = np.zeros(3) if "gravity" in without else np.array(model.opt.gravity)
+    return Description(name, bodies, joints, couplings, gravity, model)
+
+
+def moved_joints(model: Any) -> list[int]:
+    """Indices of the joints of a compiled model that are not free, in the order in which a description has them."""
+    return np.flatnonzero(model.jnt_type != int(mujoco_module().mjtJoint.mjJNT_FREE)).tolist()
 
 
 @contextmanager
@@ -255,13 +291,15 @@ def without_warnings() -> Iterator[None]:
             mujoco.set_mju_user_warning(before)
 
 
-def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
+def _measured_base(label: str, description: Description) -> int:
     """Index of the body with a free joint.  Raises ModelError: there is not one, or weights are compensated."""
-    if len(floating) != 1:
-        raise ModelError(f"{label}: {len(floating)} bodies have a free joint; a measured base takes one")
-    if any(body.gravity_compensation for body in bodies):
+    model = description.compiled
+    free = np.flatnonzero(model.jnt_type == int(mujoco_module().mjtJoint.mjJNT_FREE))
+    if len(free) != 1:
+        raise ModelError(f"{label}: {len(free)} bodies have a free joint; a measured base takes one")
+    if any(body.gravity_compensation for body in description.bodies):
         raise ModelError(f"{label}: gravity compensation on a base whose attitude is not known is not modelled")
-    return [body.name for body in bodies].index(floating[0])
+    return int(model.jnt_bodyid[free[0]]) - 1
 
 
 def _unreadable(path: str | Path, error: Exception) -> ModelError:
@@ -269,49 +307,68 @@ def _unreadable(path: str | Path, error: Exception) -> ModelError:
 
 
 def _drop_shapes(spec: Any) -> None:
-    """Remove shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
+    """Remove looks, shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
     mujoco = mujoco_module()
+    for element in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
+        element.material = ""
+    _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.materials, spec.textures)
+    spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE  # lengths of muscles, which MuJoCo simulates
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
         return
-    for referring in (spec.pairs, spec.sensors, spec.actuators, spec.keys, spec.skins):
-        for element in list(referring):
-            spec.delete(element)
-    for shape in list(spec.geoms):
-        if shape.parent.explicitinertial or shape.parent.name == "world":
-            spec.delete(shape)
+    wrapped = {x.target.name for tendon in spec.tendons for x in getattr(tendon, "path", ())}
+    needless = [x for x in spec.geoms if x.parent.explicitinertial or x.parent.name == "world"]
+    _delete(spec, [shape for shape in needless if shape.name not in wrapped])
     if not list(spec.geoms):
-        for unused in (spec.meshes, spec.hfields, spec.materials, spec.textures):
-            for element in list(unused):
-                spec.delete(element)
+        _delete(spec, spec.meshes, spec.hfields)
 
 
-def _check_supported(label: str, model: Any) -> None:
+def _delete(spec: Any, *groups: Iterable[Any]) -> None:
+    for element in [x for group in groups for x in group]:
+        spec.delete(element)
+
+
+_STATES = (
+    "TIME", "QPOS", "QVEL", "ACT", "HISTORY", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE",
+    "MOCAP_POS", "MOCAP_QUAT", "USERDATA",
+)  # fmt: skip
+"""Parts of MuJoCo's state that are joints', drives' and users'."""
+_CONSTRAINTS = ("EQUALITY", "FRICTION_DOF", "LIMIT", "CONTACT")
+"""Beginnings of the names of MuJoCo's constraints that are couplings, friction of joints, or no part of the model."""
+
+
+def _check_supported(label: str, model: Any, base: str | None) -> None:
     """Raises ModelError: the robot has parts for which there are no equations here, or numbers that overflow."""
+    mujoco = mujoco_module()
     of_bodies = (model.body_mass, model.body_inertia, model.body_ipos, model.body_pos)
     of_joints = (model.dof_armature, model.dof_damping, model.dof_frictionloss, model.jnt_stiffness, model.jnt_pos)
     largest = 1e50  # products of several of them do not overflow
     if not all(np.all(np.abs(x) < largest) for x in (*of_bodies, *of_joints)):
         raise ModelError(f"{label}: a mass, inertia, position or coefficient is {largest:g} or more; correct it")
-    kinds = mujoco_module().mjtJoint
     for k in range(model.njnt):
         name = model.joint(k).name
-        if model.jnt_type[k] == kinds.mjJNT_FREE:
+        if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_FREE and base is None:
             raise ModelError(
                 f'{label}: the base floats (free joint "{name}"); give base="held" if it was held while the '
                 'log was recorded, or base="measured" if its motion was'
             )
-        if model.jnt_type[k] == kinds.mjJNT_BALL:
+        if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_BALL:
             raise ModelError(f'{label}: joint "{name}" is a ball joint; replace it by three hinges')
-    forces = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss)
-    if model.ntendon and any(np.any(x) for x in (*forces, getattr(model, "tendon_armature", 0.0))):
-        raise ModelError(
-            f"{label}: tendons with stiffness, damping, friction or armature are not modelled; remove them"
-        )
-    if model.opt.density or model.opt.viscosity:
-        raise ModelError(f"{label}: forces of a surrounding fluid are not modelled; remove density and viscosity")
+    known = sum(getattr(mujoco.mjtState, f"mjSTATE_{x}", 0) for x in _STATES)
+    for name, part in mujoco.mjtState.__members__.items():
+        is_one = part.value & (part.value - 1) == 0 and name != "mjNSTATE"
+        if is_one and not part.value & known and mujoco.mj_stateSize(model, part.value):
+            kind = {"PLASTIC": "springs that yield (springyield)", "PLUGIN": "plugins"}.get(name[8:], name)
+            raise ModelError(f"{label} has {kind}, whose state has no equations here; leave them out")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for row in data.efc_type[: data.nefc]:
+        kind = mujoco.mjtConstraint(int(row)).name.removeprefix("mjCNSTR_")
+        if not kind.startswith(_CONSTRAINTS):
+            words = " of a ".join(kind.lower().split("_"))
+            raise ModelError(f"{label}: the {words} is not modelled; leave it out (of joints, it is modelled)")
 
 
-def _couplings(label: str, model: Any) -> Iterator[Coupling]:
+def _couplings(label: str, model: Any, moved: list[int]) -> Iterator[Coupling]:
     """Active equality constraints.  Raises ModelError: one is not between joints, which closes a kinematic loop."""
     mujoco = mujoco_module()
     for k in np.flatnonzero(model.eq_active0):
@@ -321,8 +378,9 @@ def _couplings(label: str, model: Any) -> Iterator[Coupling]:
                 f'{label}: the equality constraint "{model.equality(k).name or k}" ({kind}) closes a kinematic loop, '
                 "and only chains and trees are modelled; cut the loop, or couple its joints by polynomials"
             )
-        leader = int(model.eq_obj2id[k])
-        yield Coupling(int(model.eq_obj1id[k]), None if leader < 0 else leader, tuple(model.eq_data[k, :5].tolist()))
+        follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        own = None if leader < 0 else moved.index(leader)
+        yield Coupling(moved.index(follower), own, tuple(model.eq_data[k, :5].tolist()))
 
 
 def _drive_limits(spec: Any) -> dict[str, tuple[float, float]]:
@@ -341,50 +399,76 @@ def _drive_limits(spec: Any) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _joint(model: Any, k: int, drives: Mapping[str, tuple[float, float]]) -> Joint:
+def _joint(model: Any, k: int, drives: Mapping[str, tuple[float, float]], without: Collection[str]) -> Joint:
+    """Joint of an index; ``without`` names the flags by which the file disables springs, dampers, constraints."""
     dof, name, unlimited = model.jnt_dofadr[k], model.joint(k).name, (-np.inf, np.inf)
     low, high = drives.get(name, unlimited)
     if model.jnt_actfrclimited[k]:
         low, high = max(low, float(model.jnt_actfrcrange[k][0])), min(high, float(model.jnt_actfrcrange[k][1]))
+    rotor, drag = _of_drives(model, k)
+    own = _coefficients(model, "dof_damping", dof)
     return Joint(
         name=name or f"joint{k}",
         turns=bool(model.jnt_type[k] == mujoco_module().mjtJoint.mjJNT_HINGE),
         axis=_snapped(model.jnt_axis[k]),
         anchor=np.array(model.jnt_pos[k]),
         reference=float(model.qpos0[model.jnt_qposadr[k]]),
-        armature=float(model.dof_armature[dof]),
-        damping=_polynomial(model.dof_damping[dof], getattr(model, "dof_dampingpoly", None), dof),
-        friction=float(model.dof_frictionloss[dof]),
-        stiffness=_polynomial(model.jnt_stiffness[k], getattr(model, "jnt_stiffnesspoly", None), k),
+        armature=float(model.dof_armature[dof]) + rotor,
+        damping=(0.0,) if "damper" in without else _trimmed(own + drag),
+        drive_armature=rotor,
+        drive_damping=0.0 if "damper" in without else float(drag[0]),
+        compensated_by_drive=bool(model.jnt_actgravcomp[k]),
+        friction=0.0 if {"constraint", "frictionloss"} & set(without) else float(model.dof_frictionloss[dof]),
+        stiffness=(0.0,) if "spring" in without else _trimmed(_coefficients(model, "jnt_stiffness", k)),
         spring_reference=float(model.qpos_spring[model.jnt_qposadr[k]]),
         position_limits=tuple(model.jnt_range[k].tolist()) if model.jnt_limited[k] else unlimited,
         force_limits=(low, high),
     )
 
 
-def _polynomial(first: float, others: FloatArray | None, k: int) -> tuple[float, ...]:
-    """Coefficients without zeros at the end; versions of MuJoCo before 3.5 have the first alone."""
-    found = [float(first), *([] if others is None else others[k].tolist())]
+def _of_drives(model: Any, k: int) -> tuple[float, FloatArray]:
+    """Armature and coefficients of damping that the file's actuators give a joint, by the square of the gear."""
+    rotor, drag = 0.0, np.zeros(3)
+    if not hasattr(model, "actuator_armature"):  # before MuJoCo 3.7
+        return rotor, drag
+    of_joints = [int(getattr(mujoco_module().mjtTrn, f"mjTRN_{x}")) for x in ("JOINT", "JOINTINPARENT")]
+    for i in np.flatnonzero(model.actuator_trnid[:, 0] == k).tolist():
+        if model.actuator_trntype[i] in of_joints:
+            gear = abs(float(model.actuator_gear[i, 0]))
+            rotor += gear**2 * float(model.actuator_armature[i])
+            drag += gear**2 * _coefficients(model, "actuator_damping", i)
+    return rotor, drag
+
+
+def _coefficients(model: Any, array: str, k: int) -> FloatArray:
+    """The three coefficients of a polynomial force; versions of MuJoCo before 3.7 have the first alone."""
+    others = getattr(model, f"{array}poly", None)
+    return np.array([getattr(model, array)[k], *([0.0, 0.0] if others is None else others[k])], float)
+
+
+def _trimmed(coefficients: FloatArray) -> tuple[float, ...]:
+    """Coefficients without zeros at the end."""
+    found = coefficients.tolist()
     while len(found) > 1 and found[-1] == 0.0:
         found.pop()
     return tuple(found)
 
 
-def _body(model: Any, i: int) -> Body:
+def _body(model: Any, i: int, moved: list[int], without: Collection[str]) -> Body:
+    """Body of an index; ``without`` as in `_joint`: without springs and dampers, MuJoCo has no passive force at all."""
     centre, mass = np.array(model.body_ipos[i]), float(model.body_mass[i])
     axes = _rotation(model.body_iquat[i])
     about_centre = axes @ np.diag(0.5 * model.body_inertia[i].sum() - model.body_inertia[i]) @ axes.T
     second, first_moments = about_centre + mass * np.outer(centre, centre), (mass * centre)[:, None]
     inertial = np.block([[second, first_moments], [first_moments.T, np.array([[mass]])]])
-    first = int(model.body_jntadr[i])
     return Body(
         name=model.body(i).name or f"body{i}",
         parent=int(model.body_parentid[i]) - 1,
         rotation=_rotation(model.body_quat[i]),
         position=np.array(model.body_pos[i]),
-        joints=tuple(range(first, first + int(model.body_jntnum[i]))),
+        joints=tuple(j for j, k in enumerate(moved) if model.jnt_bodyid[k] == i),
         inertial=inertial,
-        gravity_compensation=float(model.body_gravcomp[i]),
+        gravity_compensation=0.0 if {"spring", "damper"} <= set(without) else float(model.body_gravcomp[i]),
     )
 
 

@@ -233,7 +233,7 @@ class Mechanism:
 
         ``changes`` are those of the mass of some bodies at its centre, kg, and of the inertia about it, over its value.
         """
-        motions = self._motions(q, v, a)
+        motions = self.motions(q, v, a)
         inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
         for i, (mass, inertia) in ((i, ca.vertsplit(x)) for i, x in (changes or {}).items()):
             J = self.description.bodies[i].inertial
@@ -255,7 +255,7 @@ class Mechanism:
             force += unknown.get(f"{kind}_{x.coordinate}", nominal[kind]) * signal
         stretch = x.q - joint.spring_reference
         force += sum(c * ca.fabs(x.v) ** k * x.v for k, c in enumerate(joint.damping[1:], 1))
-        return force + sum(c * ca.fabs(stretch) ** k * stretch for k, c in enumerate(joint.stiffness[1:], 1))
+        return force + sum(c * stretch ** (k + 1) for k, c in enumerate(joint.stiffness[1:], 1))
 
     def _inertial(self, i: int, values: Mapping[str, Any]) -> Any:
         """Pseudo-inertia of a body."""
@@ -264,8 +264,8 @@ class Mechanism:
             return body.inertial
         return pseudo_inertia([values[f"{kind}_{identifier(body.name)}"] for kind in INERTIAL_NAMES])
 
-    def _motions(self, q: Any, v: Any, a: Any) -> list[_Motion]:
-        """Motion of every joint of the description: of a coordinate, coupled to one, or none."""
+    def motions(self, q: Any, v: Any, a: Any) -> list[_Motion]:
+        """Motion of every joint of the description, from those of the coordinates: its own, coupled to one, or none."""
         found = [_Motion(joint.reference, 0.0, 0.0, 0.0, None) for joint in self.description.joints]
         for n, k in self.coordinates.items():
             found[k] = _Motion(q[n], v[n], a[n], 1.0, n)

@@ -16,6 +16,7 @@ from diransac.model.model import Model
 from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
+from diransac.model.robots.reference import check_forces
 from diransac.model.robots.rigid_body import position_of
 
 
@@ -95,6 +96,7 @@ def robot(
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity, "gravity"))
     label = f'robot "{path}"'
+    check_forces(label, description)
     coordinates = _coordinates(label, description, joints)
     moved = set(coordinates.values())
     for coupling in ordered_couplings(label, description):
