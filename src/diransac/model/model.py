@@ -416,6 +416,7 @@ class Model(Signals):
         Raises ModelError: there would be too many operations.
         """
         M = ca.sparsify((self.force_sign or 1) * self._mass_matrix(q, v, u, p))
+        M = ca.triu2symm(ca.triu(M)) if self.force_sign else M  # rounding may leave an entry in one triangle alone
         derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self.force_sign != 0)
         if self.force_sign == 0:
             return ca.solve(ca.densify(M), ca.densify(rhs))
