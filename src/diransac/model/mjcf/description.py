@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
-from diransac.model.robots.description import mujoco_module, parsed, without_warnings
+from diransac.model.robots.description import further_states, mujoco_module, parsed, without_warnings
 from diransac.model.robots.mechanism import identifier
 
 if TYPE_CHECKING:
@@ -117,13 +117,8 @@ def _forget_inertias(spec: Any) -> None:
 
 def _check_state(label: str, compiled: Any) -> None:
     """Raise ModelError where the state is more than positions, velocities and activations."""
-    mujoco = mujoco_module()
-    n_x = compiled.nq + compiled.nv + compiled.na
-    if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + n_x:
-        raise ModelError(
-            f"{label} has states besides positions, velocities and activations (of delays or plugins): leave these "
-            "out, or give actuation="
-        )
+    if found := further_states(compiled):
+        raise ModelError(f"{label} has states of {', '.join(found)}, which are not simulated here; leave these out")
     if not compiled.nv:
         raise ModelError(f"{label} has no joint: nothing in it moves")
 

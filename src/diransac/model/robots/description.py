@@ -327,11 +327,13 @@ def _delete(spec: Any, *groups: Iterable[Any]) -> None:
         spec.delete(element)
 
 
-_STATES = (
-    "TIME", "QPOS", "QVEL", "ACT", "HISTORY", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE",
-    "MOCAP_POS", "MOCAP_QUAT", "USERDATA",
-)  # fmt: skip
-"""Parts of MuJoCo's state that are joints', drives' and users'."""
+_STATES = {
+    "TIME", "QPOS", "QVEL", "ACT", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE", "MOCAP_POS",
+    "MOCAP_QUAT", "USERDATA",
+}  # fmt: skip
+"""Parts of MuJoCo's state that are those of joints, drives and users."""
+_ATTRIBUTES = {"HISTORY": "delays (delay, nsample)", "PLASTIC": "springs that yield (springyield)", "PLUGIN": "plugins"}
+"""Attributes from which further parts come."""
 _CONSTRAINTS = ("EQUALITY", "FRICTION_DOF", "LIMIT", "CONTACT")
 """Beginnings of the names of MuJoCo's constraints that are couplings, friction of joints, or no part of the model."""
 
@@ -353,12 +355,8 @@ def _check_supported(label: str, model: Any, base: str | None) -> None:
             )
         if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_BALL:
             raise ModelError(f'{label}: joint "{name}" is a ball joint; replace it by three hinges')
-    known = sum(getattr(mujoco.mjtState, f"mjSTATE_{x}", 0) for x in _STATES)
-    for name, part in mujoco.mjtState.__members__.items():
-        is_one = part.value & (part.value - 1) == 0 and name != "mjNSTATE"
-        if is_one and not part.value & known and mujoco.mj_stateSize(model, part.value):
-            kind = {"PLASTIC": "springs that yield (springyield)", "PLUGIN": "plugins"}.get(name[8:], name)
-            raise ModelError(f"{label} has {kind}, whose state has no equations here; leave them out")
+    if found := further_states(model, {"HISTORY"}):  # drives' delays are those of their forces
+        raise ModelError(f"{label} has {', '.join(found)}, for which there are no equations here; leave them out")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for row in data.efc_type[: data.nefc]:
@@ -366,6 +364,16 @@ def _check_supported(label: str, model: Any, base: str | None) -> None:
         if not kind.startswith(_CONSTRAINTS):
             words = " of a ".join(kind.lower().split("_"))
             raise ModelError(f"{label}: the {words} is not modelled; leave it out (of joints, it is modelled)")
+
+
+def further_states(model: Any, known: Collection[str] = ()) -> list[str]:
+    """What gives a compiled model states besides those of joints, activations, and `known` names of MuJoCo's parts."""
+    mujoco, found = mujoco_module(), list[str]()
+    for name, part in mujoco.mjtState.__members__.items():
+        kind, is_one = name.removeprefix("mjSTATE_"), name != "mjNSTATE" and part.value & (part.value - 1) == 0
+        if is_one and kind not in _STATES | set(known) and mujoco.mj_stateSize(model, part.value):
+            found.append(_ATTRIBUTES.get(kind, kind))
+    return found
 
 
 def _couplings(label: str, model: Any, moved: list[int]) -> Iterator[Coupling]:
