@@ -176,8 +176,8 @@ def test_a_mask_that_names_nothing_is_refused(hopper_file: Path, masks: list[str
             "has states of delays (delay, nsample), which are not simulated",
         ),
         (
-            '<mujoco><worldbody><body><joint name="j" stiffness="5" springyield=".2"/><geom size=".1"/></body></worldbody>'
-            "</mujoco>",
+            '<mujoco><worldbody><body><joint name="j" stiffness="5" springyield=".2"/><geom size=".1"/></body>'
+            "</worldbody></mujoco>",
             "has states of springs that yield (springyield)",
         ),
     ],
