@@ -11,7 +11,9 @@ import numpy as np
 from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
 from diransac.model.robots.description import further_states, mujoco_module, parsed, without_warnings
+from diransac.model.robots.document import Document
 from diransac.model.robots.mechanism import identifier
+from diransac.model.robots.written import with_inertials
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -92,8 +94,10 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     _check_state(label, compiled)
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
-    compiled_of(label, spec)
-    return str(spec.to_xml()), drives
+    compiled = compiled_of(label, spec)
+    with without_warnings():
+        text = str(spec.to_xml())  # in which masses are as before they are bounded, or scaled to a total
+    return with_inertials(Document(text.encode(), label), compiled), drives
 
 
 def compiled_of(label: str, source: Any) -> Any:

@@ -19,10 +19,11 @@ from diransac.model.mjcf.description import (
     joint_columns,
     sensor_columns,
 )
-from diransac.model.mjcf.masks import ARRAYS, Place, Unknown, unknowns_of
+from diransac.model.mjcf.masks import Unknown, unknowns_of
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.fields import ARRAYS, Place
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -174,13 +175,15 @@ def mujoco_module() -> ModuleType:
     return mujoco  # type: ignore[no-any-return]  # without annotations
 
 
-def parsed(path: str | Path) -> Any:
+def parsed(path: str | Path, text: str | None = None) -> Any:
     """MuJoCo's editable form (``MjSpec``) of a file.
 
     Parameters
     ----------
     path : str or Path
         MJCF or URDF.
+    text : str, optional
+        What is read in place of the file's text, as if it stood in the same folder.
 
     Raises
     ------
@@ -193,7 +196,41 @@ def parsed(path: str | Path) -> Any:
     check_description(Path(path), f'robot description "{path}"')
     try:
         with without_warnings():
-            return mujoco.MjSpec.from_file(str(path))
+            if text is None:
+                return mujoco.MjSpec.from_file(str(path))
+            name = f"{uuid4().hex}{Path(path).suffix}"  # of a file that is not there
+            return mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: text.encode()})
+    except _FAILURES as error:
+        raise _unreadable(path, error) from error
+
+
+def compiled_file(path: str | Path, text: str | None = None, *, bare: bool = False) -> Any:
+    """MuJoCo's compiled model of a file, with all of its bodies.
+
+    Parameters
+    ----------
+    path, text
+        As for `parsed`.
+    bare : bool, optional
+        Without shapes that give no inertia, whose files need not be there.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read or compiled.
+    """
+    spec = parsed(path, text)
+    if bare:
+        drop_shapes(spec)
+    return _compiled(path, spec)
+
+
+def _compiled(path: str | Path, spec: Any) -> Any:
+    """MuJoCo's model of its editable form, with all of its bodies."""
+    spec.compiler.fusestatic = False
+    try:
+        with without_warnings():
+            return spec.compile()
     except _FAILURES as error:
         raise _unreadable(path, error) from error
 
@@ -225,13 +262,8 @@ def _description(path: str | Path, base: str | None) -> Description:
     """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
     label, spec = f'robot description "{path}"', parsed(path)
     drives = _drive_limits(spec)
-    _drop_shapes(spec)
-    try:
-        spec.compiler.fusestatic = False
-        with without_warnings():
-            model = spec.compile()
-    except _FAILURES as error:
-        raise _unreadable(path, error) from error
+    drop_shapes(spec)
+    model = _compiled(path, spec)
     if model.njnt > MOST_JOINTS:
         raise ModelError(f"{label}: it has {beyond(MOST_JOINTS, 'joints', model.njnt)}; split the robot")
     _check_supported(label, model, base)
@@ -306,7 +338,7 @@ def _unreadable(path: str | Path, error: Exception) -> ModelError:
     return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
 
 
-def _drop_shapes(spec: Any) -> None:
+def drop_shapes(spec: Any) -> None:
     """Remove looks, shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
     mujoco = mujoco_module()
     for element in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
