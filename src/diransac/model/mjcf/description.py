@@ -72,7 +72,7 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
         The file cannot be read, or has what is not simulated here: plugins, soft bodies, delays; or the drives are none
         that MuJoCo has.
     """
-    label, spec = f'robot description "{path}"', parsed(path)
+    label, spec = f'robot description "{path}"', parsed(path).spec
     for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
         if len(list(elements)):
             raise ModelError(f"{label} has {what}, which are not simulated here; leave them out")

@@ -16,6 +16,7 @@ from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
 from diransac.model.robots.consistency import consistent_parameters, inconsistency
 from diransac.model.robots.description import Description, Joint, read_description
+from diransac.model.robots.inertias import with_unknown
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 
 
@@ -129,6 +130,7 @@ def _estimates(
         return of_joints, {}
     every = list(places.values())
     names, constants, combinations = _combinations([every[k] for k in known])
+    description = with_unknown(description, [i for i, x in enumerate(description.bodies) if x.name in names])
     bodies, joints = {x.name: x for x in description.bodies}, {x.name: x for x in description.joints}
     missing = [name for name in names if name not in bodies]
     if missing:

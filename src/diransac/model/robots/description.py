@@ -11,7 +11,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,6 +21,8 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.limits import MOST_JOINTS, beyond
+from diransac.model.robots.formats import Outline, check_format, outline
+from diransac.model.robots.inertias import Flaw, gives_inertia, repair, without_placeholders
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
 
@@ -135,6 +137,10 @@ class Description:
         In the world frame, m/s^2.
     base : int, optional
         Index of a body whose motion is measured; by default no body of those on the world moves by itself.
+    flaws : mapping of int to Flaw, optional
+        What the file lacks of the inertias of bodies, by index.
+    velocity_limits : mapping of str to float, optional
+        Largest speeds of joints by name, rad/s or m/s.
     """
 
     name: str
@@ -143,6 +149,8 @@ class Description:
     couplings: tuple[Coupling, ...]
     gravity: FloatArray
     base: int | None = None
+    flaws: Mapping[int, Flaw] = field(default_factory=dict)
+    velocity_limits: Mapping[str, float] = field(default_factory=dict)
 
 
 def mujoco_module() -> ModuleType:
@@ -163,8 +171,27 @@ def mujoco_module() -> ModuleType:
     return mujoco  # type: ignore[no-any-return]  # without annotations
 
 
-def parsed(path: str | Path) -> Any:
-    """MuJoCo's editable form (``MjSpec``) of a file.
+@dataclass(frozen=True)
+class Parsed:
+    """A file before it is compiled.
+
+    Parameters
+    ----------
+    spec : MjSpec
+        MuJoCo's editable form, in which all inertias are possible.
+    flaws : list of (body of the spec, Flaw)
+        Inertias that are not those of the file.
+    outline : Outline
+        Of the file's text.
+    """
+
+    spec: Any
+    flaws: list[tuple[Any, Flaw]]
+    outline: Outline
+
+
+def parsed(path: str | Path) -> Parsed:
+    """A description file in MuJoCo's editable form.
 
     Parameters
     ----------
@@ -176,15 +203,18 @@ def parsed(path: str | Path) -> Any:
     ModelError
         There is no such file, or it is neither MJCF nor URDF.
     """
-    mujoco = mujoco_module()
+    mujoco, label = mujoco_module(), f'robot description "{path}"'
     if not Path(path).is_file():
-        raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
-    check_description(Path(path), f'robot description "{path}"')
+        raise ModelError(f"{label} does not exist; give an MJCF (.xml) or URDF file")
+    check_description(Path(path), label)
+    text = outline(path)
+    check_format(text, path, label)
     try:
         with without_warnings():
-            return mujoco.MjSpec.from_file(str(path))
+            spec = mujoco.MjSpec.from_file(str(path))
     except _FAILURES as error:
         raise _unreadable(path, error) from error
+    return Parsed(spec, repair(spec, is_urdf=text.root == "robot"), text)
 
 
 def read_description(path: str | Path, base: str | None = None) -> Description:
@@ -212,7 +242,8 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
 
 def _description(path: str | Path, base: str | None) -> Description:
     """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
-    spec = parsed(path)
+    file = parsed(path)
+    spec = file.spec
     floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
     names = [joint.parent.name for joint in floating]
     for joint in floating:
@@ -224,7 +255,7 @@ def _description(path: str | Path, base: str | None) -> Description:
         with without_warnings():
             model = spec.compile()
     except _FAILURES as error:
-        raise _unreadable(path, error) from error
+        raise _missing_mesh(path, spec, error) or _unreadable(path, error) from error
     label = f'robot description "{path}"'
     _check_supported(label, model)
     if model.njnt > MOST_JOINTS:
@@ -232,10 +263,12 @@ def _description(path: str | Path, base: str | None) -> Description:
     joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
     if not joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
-    bodies = tuple(_body(model, i) for i in range(1, model.nbody))
+    flaws = {body.id - 1: flaw for body, flaw in file.flaws}
+    bodies = without_placeholders(tuple(_body(model, i) for i in range(1, model.nbody)), flaws)
     name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
     measured = _measured_base(label, bodies, names) if base == "measured" else None
-    return Description(name, bodies, joints, tuple(_couplings(label, model)), np.array(model.opt.gravity), measured)
+    couplings, gravity = tuple(_couplings(label, model)), np.array(model.opt.gravity)
+    return Description(name, bodies, joints, couplings, gravity, measured, flaws, file.outline.velocity_limits)
 
 
 @contextmanager
@@ -268,21 +301,43 @@ def _unreadable(path: str | Path, error: Exception) -> ModelError:
     return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
 
 
+def _missing_mesh(path: str | Path, spec: Any, error: Exception) -> ModelError | None:
+    """The error of a file of a mesh that is not there and gives a body its inertia; None for another error."""
+    missing = re.search(r"opening file '(.*?)'", str(error))
+    if missing is None:
+        return None
+    bodies = ", ".join(dict.fromkeys(shape.parent.name for shape in spec.geoms if shape.meshname))
+    return ModelError(
+        f'robot description "{path}": the mesh file "{missing[1]}" does not exist, and bodies without an inertial have '
+        f"that of their meshes ({bodies}); give each an inertial in the description, or the file"
+    )
+
+
 def _drop_shapes(spec: Any) -> None:
     """Remove shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
     mujoco = mujoco_module()
-    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
-        return
-    for referring in (spec.pairs, spec.sensors, spec.actuators, spec.keys, spec.skins):
+    by_shapes = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    wrapped = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER) if list(spec.tendons) else ()
+    for referring in (spec.pairs, spec.sensors, spec.actuators, spec.keys, spec.skins, spec.lights):
         for element in list(referring):
             spec.delete(element)
-    for shape in list(spec.geoms):
-        if shape.parent.explicitinertial or shape.parent.name == "world":
+    for shape in (x for x in spec.geoms if x.type not in wrapped):
+        own = shape.parent
+        counts = _moves(own) or spec.compiler.settotalmass > 0.0  # which scales all masses
+        if not (counts and gives_inertia(spec, shape)) or (own.explicitinertial and not by_shapes):
             spec.delete(shape)
-    if not list(spec.geoms):
-        for unused in (spec.meshes, spec.hfields, spec.materials, spec.textures):
-            for element in list(unused):
-                spec.delete(element)
+    for shape in (*spec.geoms, *spec.sites, *spec.tendons):
+        shape.material = ""
+    needed = {name for shape in spec.geoms for name in (shape.meshname, shape.hfieldname)}
+    for mesh in (x for x in (*spec.meshes, *spec.hfields) if x.name not in needed):
+        spec.delete(mesh)
+    for unused in (*spec.materials, *spec.textures):
+        spec.delete(unused)
+
+
+def _moves(body: Any) -> bool:
+    """Whether joints move a body of MuJoCo's editable form."""
+    return body.parent is not None and (bool(list(body.joints)) or _moves(body.parent))
 
 
 def _check_supported(label: str, model: Any) -> None:
