@@ -60,10 +60,14 @@ def forces(path, **arguments):
     return np.array([required(model, *motion, p) for motion in motions(len(model.coordinates))])
 
 
+def tensor(inertia):
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def nearest(inertia):
     """Inertia whose second moments are the semidefinite ones nearest to those of another, by Higham 1988."""
-    xx, yy, zz, xy, xz, yz = inertia
-    I = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    I = tensor(inertia)
     S = 0.5 * np.trace(I) * np.eye(3) - I
     _, s, V = np.linalg.svd(S)
     P = 0.5 * (S + V.T @ np.diag(s) @ V)  # with the polar factor of S
@@ -195,6 +199,38 @@ def test_the_mass_of_shapes_in_a_urdf_is_said(described):
     assert dr.models.robot(path).notes == (
         "the mass of bodies without an inertial is that of their shapes, of 1000 kg/m^3: first",
     )
+
+
+# ---------------------------------------------------------------------- simulated
+
+
+@EVERY_INERTIA
+def test_a_simulated_machine_has_the_nearest_possible_inertias(described, inertia):
+    path = described(chain(link("first"), link("second", inertia)))
+    model = dr.models.mujoco(path, unknown=["joint/j0.damping", "joint/j1.damping"])
+    assert model.with_fixed({"joint/j0.damping": 0.1}).notes == model.notes
+    assert "replaced by the nearest possible ones: second (" in model.notes[0]
+    masses, expected = model.compiled, compiled(described(chain(link("first"), link("second")), "good.urdf"))[0]
+    assert masses.body_mass[-1] == expected.body_mass[-1]
+    assert np.sort(masses.body_inertia[-1]) == pytest.approx(np.linalg.eigvalsh(tensor(nearest(inertia))), abs=4e-6)
+
+
+def test_a_plate_can_be_simulated_whatever_the_digits_of_the_text(described):
+    plate = "0.01234567 0.02345678 0.03580245"
+    path = described(
+        f"""<mujoco><worldbody><body name="a"><joint name="j" axis="1 2 0"/>
+          <inertial pos="0 0 -.2" mass="1" diaginertia="{plate}"/></body></worldbody></mujoco>""",
+        "plate.xml",
+    )
+    model = dr.models.mujoco(path, unknown=["joint/j.damping"])
+    assert model.notes == ()
+    assert model.compiled.body_inertia[-1] == pytest.approx(compiled(path)[0].body_inertia[-1], rel=1e-4)
+
+
+def test_a_simulated_joint_that_moves_no_mass_is_named(described):
+    path = described(chain(link("first"), '<link name="second"/>'))
+    with pytest.raises(ModelError, match='nothing that body "second" carries has a mass'):
+        dr.models.mujoco(path, unknown=["joint/j0.damping"])
 
 
 # ---------------------------------------------------------------------- notes

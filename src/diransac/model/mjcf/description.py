@@ -11,6 +11,7 @@ import numpy as np
 from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
 from diransac.model.robots.description import mujoco_module, parsed, without_warnings
+from diransac.model.robots.inertias import THIN_IN_TEXT, notes_on_simulated
 from diransac.model.robots.mechanism import identifier
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class SensorColumns:
     of_forces: bool
 
 
-def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, dict[str, str] | None]:
+def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, dict[str, str] | None, tuple[str, ...]]:
     """A description as one text that MuJoCo reads, without visual shapes and other files; and the drives' inputs.
 
     Parameters
@@ -65,14 +66,17 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     str
     dict of str to str, or None
         Unit of each input, in the order of MuJoCo's controls; None: the file's actuators.
+    tuple of str
+        Notes on inertias that are not the file's.
 
     Raises
     ------
     ModelError
         The file cannot be read, or has what is not simulated here: plugins, soft bodies, delays; or the drives are none
-        that MuJoCo has.
+        that MuJoCo has; or nothing that a joint moves has a mass.
     """
-    label, spec = f'robot description "{path}"', parsed(path).spec
+    label, file = f'robot description "{path}"', parsed(path, THIN_IN_TEXT)
+    spec = file.spec
     for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
         if len(list(elements)):
             raise ModelError(f"{label} has {what}, which are not simulated here; leave them out")
@@ -90,10 +94,11 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
         spec.add_key(name="home", **pose)
     compiled = compiled_of(label, spec)
     _check_state(label, compiled)
+    notes = notes_on_simulated(label, compiled, file.flaws)
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
     compiled_of(label, spec)
-    return str(spec.to_xml()), drives
+    return str(spec.to_xml()), drives, notes
 
 
 def compiled_of(label: str, source: Any) -> Any:

@@ -22,7 +22,7 @@ from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.limits import MOST_JOINTS, beyond
 from diransac.model.robots.formats import Outline, check_format, outline
-from diransac.model.robots.inertias import Flaw, gives_inertia, repair, without_placeholders
+from diransac.model.robots.inertias import THIN, Flaw, gives_inertia, repair, without_placeholders
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
 
@@ -190,13 +190,15 @@ class Parsed:
     outline: Outline
 
 
-def parsed(path: str | Path) -> Parsed:
+def parsed(path: str | Path, thin: float = THIN) -> Parsed:
     """A description file in MuJoCo's editable form.
 
     Parameters
     ----------
     path : str or Path
         MJCF or URDF.
+    thin : float, optional
+        Least second moment of a body over the largest, as of `repair`.
 
     Raises
     ------
@@ -214,7 +216,7 @@ def parsed(path: str | Path) -> Parsed:
             spec = mujoco.MjSpec.from_file(str(path))
     except _FAILURES as error:
         raise _unreadable(path, error) from error
-    return Parsed(spec, repair(spec, is_urdf=text.root == "robot"), text)
+    return Parsed(spec, repair(spec, is_urdf=text.root == "robot", thin=thin), text)
 
 
 def read_description(path: str | Path, base: str | None = None) -> Description:

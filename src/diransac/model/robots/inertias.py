@@ -7,7 +7,7 @@ others, of frames without a mass, of rounding and of placeholders, which MuJoCo 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,14 +21,17 @@ if TYPE_CHECKING:
 
 Kind = Literal["impossible", "massless", "shapes"]
 
-_THIN = 1e-10
+THIN = 1e-10
 """Least second moment over the largest, which MuJoCo compiles whatever its rounding."""
+THIN_IN_TEXT = 3e-5
+"""The same of a body that is written with six digits, as MuJoCo writes, and compiled again."""
 _LEAST = 1e-14
 """Least second moment, kg m^2; MuJoCo compiles no moving body with an inertia below 1e-15."""
 _ROUNDING = 1e-9
 """Negative second moment over the largest of a thin body that was rounded."""
 _NO_MASS = 1e-12
 """Mass, kg, that stands for none while MuJoCo compiles a body that moves."""
+_REPLACED = "impossible inertias in the file were replaced by the nearest possible ones: {}"
 _DENSITY = 1000.0
 """Of the ball for which a body is taken whose inertia is unknown, kg/m^3; MuJoCo's of shapes."""
 
@@ -52,10 +55,18 @@ class Flaw:
 # ---------------------------------------------------------------------- before MuJoCo compiles
 
 
-def repair(spec: Any, *, is_urdf: bool) -> list[tuple[Any, Flaw]]:
+def repair(spec: Any, *, is_urdf: bool, thin: float = THIN) -> list[tuple[Any, Flaw]]:
     """Replace inertias that MuJoCo does not compile by the nearest possible ones, in its editable form (``MjSpec``).
 
     A body that moves without a mass, itself or by bodies welded to it, gets one that `without_placeholders` removes.
+
+    Parameters
+    ----------
+    spec : MjSpec
+    is_urdf : bool
+        Whether the file is a URDF, in which a body without an inertial has no mass.
+    thin : float, optional
+        Least second moment over the largest of a body.
 
     Returns
     -------
@@ -64,12 +75,12 @@ def repair(spec: Any, *, is_urdf: bool) -> list[tuple[Any, Flaw]]:
     flaws = []
     for body in list(spec.bodies)[1:]:
         by_shapes = _is_of_shapes(spec, body)
-        if body.explicitinertial and not by_shapes and (reason := _made_possible(spec, body)):
+        if body.explicitinertial and not by_shapes and (reason := _made_possible(spec, body, thin)):
             flaws.append((body, Flaw("impossible", reason)))
         if list(body.joints) and not _carries_mass(spec, body):
             body.mass, body.explicitinertial = _NO_MASS, True
             body.ipos = np.nan_to_num(body.ipos)
-            _made_possible(spec, body)
+            _made_possible(spec, body, thin)
             flaws.append((body, Flaw("massless")))
         if by_shapes and is_urdf:
             flaws.append((body, Flaw("shapes")))
@@ -97,7 +108,7 @@ def _carries_mass(spec: Any, body: Any) -> bool:
     return has_own or any(_carries_mass(spec, x) for x in body.bodies if not list(x.joints))
 
 
-def _made_possible(spec: Any, body: Any) -> str:
+def _made_possible(spec: Any, body: Any, thin: float) -> str:
     """Give a body the possible inertia that is nearest to its own in the Frobenius norm of S; why it was impossible.
 
     Numbers that are not finite stay: they are refused once they are compiled.
@@ -114,7 +125,7 @@ def _made_possible(spec: Any, body: Any) -> str:
         if compiler.balanceinertia:
             return ""
     second = 0.5 * moments.sum() - moments
-    least = max(_THIN * second.max(), _LEAST)
+    least = max(thin * second.max(), _LEAST)
     if second.min() >= least:
         return ""
     is_zero = np.abs(second).max() <= _LEAST
@@ -208,7 +219,7 @@ def notes_on_inertias(
     matters = {i: flaw for i, flaw in description.flaws.items() if i in moving and i not in unknown}
     _check_masses(label, description, moved, unknown)
     if strict and matters:
-        named = _listed(description, matters)
+        named = _listed(_named(description, matters))
         raise ModelError(
             f"{label}: inertias of bodies that move are no possible ones in the file: {named}; correct them, name the "
             'bodies in bodies, lock their joints, or give inertia="nearest"'
@@ -218,23 +229,41 @@ def notes_on_inertias(
     sentences = {
         "impossible inertias in the file have no effect, since these bodies do not move: {}": irrelevant,
         "impossible inertias in the file are unknown here, with nominal values of balls: {}": replaced,
-        "impossible inertias in the file were replaced by the nearest possible ones: {}; correct them, or name the "
-        "bodies in bodies": _of_kind(matters, "impossible"),
+        f"{_REPLACED}; correct them, or name the bodies in bodies": _of_kind(matters, "impossible"),
         "bodies that move have no mass in the file, and add none: {}": _of_kind(matters, "massless"),
         "the mass of bodies without an inertial is that of their shapes, of 1000 kg/m^3: {}": _of_kind(
             matters, "shapes"
         ),
     }
-    return tuple(text.format(_listed(description, own)) for text, own in sentences.items() if own)
+    return tuple(text.format(_listed(_named(description, own))) for text, own in sentences.items() if own)
+
+
+def notes_on_simulated(label: str, compiled: Any, flaws: Sequence[tuple[Any, Flaw]]) -> tuple[str, ...]:
+    """A sentence on inertias that `repair` replaced, of a model of MuJoCo that it compiled.
+
+    Raises
+    ------
+    ModelError
+        Nothing that a joint moves has a mass.
+    """
+    for body, flaw in flaws:
+        if flaw.kind == "massless" and compiled.body_subtreemass[body.id] <= _NO_MASS * compiled.nbody:
+            raise ModelError(f'{label}: nothing that body "{body.name}" carries has a mass; give it one in the file')
+    named = {body.name: flaw for body, flaw in flaws if flaw.kind == "impossible" and compiled.body_weldid[body.id]}
+    return (_REPLACED.format(_listed(named)),) if named else ()
 
 
 def _of_kind(flaws: Mapping[int, Flaw], kind: Kind) -> dict[int, Flaw]:
     return {i: flaw for i, flaw in flaws.items() if flaw.kind == kind}
 
 
-def _listed(description: Description, flaws: Mapping[int, Flaw]) -> str:
+def _named(description: Description, flaws: Mapping[int, Flaw]) -> dict[str, Flaw]:
+    return {description.bodies[i].name: flaw for i, flaw in flaws.items()}
+
+
+def _listed(flaws: Mapping[str, Flaw]) -> str:
     """Names of bodies with reasons, five at most."""
-    named = [description.bodies[i].name + (f" ({x.reason})" if x.reason else "") for i, x in flaws.items()]
+    named = [name + (f" ({x.reason})" if x.reason else "") for name, x in flaws.items()]
     return ", ".join(named[:5]) + (f" and {len(named) - 5} more" if len(named) > 5 else "")
 
 
