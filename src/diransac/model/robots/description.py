@@ -308,10 +308,11 @@ def _missing_mesh(path: str | Path, spec: Any, error: Exception) -> ModelError |
     missing = re.search(r"opening file '(.*?)'", str(error))
     if missing is None:
         return None
-    bodies = ", ".join(dict.fromkeys(shape.parent.name for shape in spec.geoms if shape.meshname))
+    bodies = list(dict.fromkeys(shape.parent.name or "without a name" for shape in spec.geoms if shape.meshname))
+    named = ", ".join(bodies[:5]) + (f" and {len(bodies) - 5} more" if len(bodies) > 5 else "")
     return ModelError(
         f'robot description "{path}": the mesh file "{missing[1]}" does not exist, and bodies without an inertial have '
-        f"that of their meshes ({bodies}); give each an inertial in the description, or the file"
+        f"that of their meshes ({named}); give each an inertial in the description, or the file"
     )
 
 

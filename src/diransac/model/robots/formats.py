@@ -67,7 +67,9 @@ def check_format(found: Outline, path: str | Path, label: str) -> None:
     """Raise ModelError where a description is of a format that MuJoCo does not read, with what to do."""
     if found.has_macros:
         name = Path(path).name
-        target = name.removesuffix(".xacro").removesuffix(".urdf") + ".urdf"
+        target = name.removesuffix(".xacro").removesuffix(".urdf") + (
+            "-expanded.urdf" if name.endswith(".urdf") else ".urdf"
+        )
         raise ModelError(f"{label} has macros of Xacro; expand them: xacro {name} > {target}")
     if found.root in _REMEDIES:
         raise ModelError(f"{label} {_REMEDIES[found.root]}")
