@@ -73,6 +73,10 @@ class RobotOptions:
     base: Annotated[
         str | None, _option(metavar="held|measured", help="A floating base: held, or with a measured motion.")
     ] = None
+    inertia: Annotated[
+        str | None,
+        _option(metavar="nearest|strict", help="Impossible inertias: nearest possible ones, or an error."),
+    ] = None
     simulator: Annotated[
         str | None, _option(metavar="mujoco", help="Contacts, loops, tendons; --unknown KIND/NAME.FIELD,...")
     ] = None
@@ -127,7 +131,7 @@ class RobotOptions:
         """
         if self.simulator != "mujoco":
             raise typer.BadParameter(f"--simulator {self.simulator} is unknown; there is mujoco")
-        for name in ("bodies", "joints", "base"):
+        for name in ("bodies", "joints", "base", "inertia"):
             if getattr(self, name) is not None:
                 raise typer.BadParameter(f"--{name} belongs to equations; with --simulator, name it in --unknown")
         if self.unknown is None:
@@ -140,6 +144,8 @@ class RobotOptions:
             found["unknown"] = names(self.unknown)
         if self.bodies is not None:
             found["bodies"] = "all" if self.bodies == "all" else names(self.bodies)
+        if self.inertia is not None:
+            found["inertia"] = self.inertia
         if self.joints is not None:
             listed = names(self.joints)
             found["joints"] = self.joints if "{}" in self.joints else listed

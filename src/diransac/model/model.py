@@ -114,6 +114,9 @@ class Model(Signals):
     held_by: Callable[[Model], Sequence[HeldConstant]] | None = None
     """Maker of the constants that the model holds; a model that was stored has none."""
 
+    notes: tuple[str, ...] = ()
+    """Sentences on how the model was made, such as what its description lacks; a model that was stored has none."""
+
     @cached_property
     def held(self) -> tuple[HeldConstant, ...]:
         """Constants that are no parameters, such as masses of bodies in a description, and might be wrong."""
@@ -403,7 +406,7 @@ class Model(Signals):
             sensors=sensors,
             description=self.description,
         )
-        model.held_by = self.held_by
+        model.held_by, model.notes = self.held_by, self.notes
         return model
 
     def _coordinate_rates(self, q: ca.SX, v: ca.SX) -> ca.SX:

@@ -99,7 +99,7 @@ def _part(model: Model, name: str, group: Sequence[int]) -> Model:
     def equations(*vectors: Symbols) -> Sequence[Any]:
         return [model.residual(*arguments(*vectors))[np.flatnonzero(rows).tolist()]]
 
-    return Model(
+    part = Model(
         f"{model.name} {name}",
         {n: unit for n, unit in model.coordinates.items() if n in states},
         _selected(model.inputs, inputs),
@@ -109,6 +109,8 @@ def _part(model: Model, name: str, group: Sequence[int]) -> Model:
         sensors=_selected(model.sensors_of(arguments), shown),
         description=model.description,
     )
+    part.notes = model.notes
+    return part
 
 
 def _selected(items: Mapping[str, Any], mask: BoolArray) -> dict[str, Any]:

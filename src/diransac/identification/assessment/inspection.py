@@ -131,7 +131,7 @@ class Inspection:
     signals : mapping of str to SignalFacts
         Statistics of each signal.
     notes : tuple of str
-        Findings on reading, a sentence each.
+        Findings on reading, a sentence each; of the first log also those of the model.
     fitness : Fitness, optional
         Suitability for a model; None where no model was given.
     events : mapping of str to float
@@ -223,7 +223,8 @@ def inspect(
     several, model = as_logs(logs), None if model is None else KnownParameters.of(model, fixed, None).free()
     first, *others = contents = [_contents(log, model) for log in several]
     fitness = None if model is None else _fitness(several, model, contents)
-    return dataclasses.replace(first, fitness=fitness, others=tuple(others))
+    notes = (*first.notes, *(() if model is None else model.notes))
+    return dataclasses.replace(first, notes=notes, fitness=fitness, others=tuple(others))
 
 
 def _contents(log: Log, model: Model | None) -> Inspection:

@@ -12,6 +12,7 @@ from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
 from diransac.model.robots.description import further_states, mujoco_module, parsed, without_warnings
 from diransac.model.robots.document import Document
+from diransac.model.robots.inertias import THIN_IN_TEXT, notes_on_simulated
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.written import with_inertials
 
@@ -52,7 +53,7 @@ class SensorColumns:
     of_forces: bool
 
 
-def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, dict[str, str] | None]:
+def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, dict[str, str] | None, tuple[str, ...]]:
     """A description as one text that MuJoCo reads, without visual shapes and other files; and the drives' inputs.
 
     Parameters
@@ -67,14 +68,17 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     str
     dict of str to str, or None
         Unit of each input, in the order of MuJoCo's controls; None: the file's actuators.
+    tuple of str
+        Notes on inertias that are not the file's.
 
     Raises
     ------
     ModelError
         The file cannot be read, or has what is not simulated here: plugins, soft bodies, delays; or the drives are none
-        that MuJoCo has.
+        that MuJoCo has; or nothing that a joint moves has a mass.
     """
-    label, spec = f'robot description "{path}"', parsed(path)
+    label, file = f'robot description "{path}"', parsed(path, thin=THIN_IN_TEXT)
+    spec = file.spec
     for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
         if len(list(elements)):
             raise ModelError(f"{label} has {what}, which are not simulated here; leave them out")
@@ -92,12 +96,13 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
         spec.add_key(name="home", **pose)
     compiled = compiled_of(label, spec)
     _check_state(label, compiled)
+    notes = notes_on_simulated(label, compiled, file.flaws)
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
     compiled = compiled_of(label, spec)
     with without_warnings():
         text = str(spec.to_xml())  # in which masses are as before they are bounded, or scaled to a total
-    return with_inertials(Document(text.encode(), label), compiled), drives
+    return with_inertials(Document(text.encode(), label), compiled), drives, notes
 
 
 def compiled_of(label: str, source: Any) -> Any:

@@ -22,6 +22,8 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.limits import MOST_JOINTS, beyond
+from diransac.model.robots.formats import Outline, check_format, outline
+from diransac.model.robots.inertias import THIN, Flaw, gives_inertia, repair, without_placeholders
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
 
@@ -146,6 +148,10 @@ class Description:
         MuJoCo's model of the same tree, without meshes.
     base : int, optional
         Index of a body whose motion is measured; by default no body of those on the world moves by itself.
+    flaws : mapping of int to Flaw, optional
+        What the file lacks of the inertias of bodies, by index.
+    velocity_limits : mapping of str to float, optional
+        Largest speeds of joints by name, rad/s or m/s.
     """
 
     name: str
@@ -155,6 +161,8 @@ class Description:
     gravity: FloatArray
     compiled: Any = field(compare=False, repr=False)
     base: int | None = None
+    flaws: Mapping[int, Flaw] = field(default_factory=dict)
+    velocity_limits: Mapping[str, float] = field(default_factory=dict)
 
 
 def mujoco_module() -> ModuleType:
@@ -175,8 +183,27 @@ def mujoco_module() -> ModuleType:
     return mujoco  # type: ignore[no-any-return]  # without annotations
 
 
-def parsed(path: str | Path, text: str | None = None) -> Any:
-    """MuJoCo's editable form (``MjSpec``) of a file.
+@dataclass(frozen=True)
+class Parsed:
+    """A file before it is compiled.
+
+    Parameters
+    ----------
+    spec : MjSpec
+        MuJoCo's editable form, in which all inertias are possible.
+    flaws : list of (body of the spec, Flaw)
+        Inertias that are not those of the file.
+    outline : Outline
+        Of the file's text.
+    """
+
+    spec: Any
+    flaws: list[tuple[Any, Flaw]]
+    outline: Outline
+
+
+def parsed(path: str | Path, text: str | None = None, thin: float = THIN) -> Parsed:
+    """A description file in MuJoCo's editable form.
 
     Parameters
     ----------
@@ -184,24 +211,30 @@ def parsed(path: str | Path, text: str | None = None) -> Any:
         MJCF or URDF.
     text : str, optional
         What is read in place of the file's text, as if it stood in the same folder.
+    thin : float, optional
+        Least second moment of a body over the largest, as of `repair`.
 
     Raises
     ------
     ModelError
         There is no such file, or it is neither MJCF nor URDF.
     """
-    mujoco = mujoco_module()
+    mujoco, label = mujoco_module(), f'robot description "{path}"'
     if not Path(path).is_file():
-        raise ModelError(f'robot description "{path}" does not exist; give an MJCF (.xml) or URDF file')
-    check_description(Path(path), f'robot description "{path}"')
+        raise ModelError(f"{label} does not exist; give an MJCF (.xml) or URDF file")
+    check_description(Path(path), label)
+    own = outline(path)
+    check_format(own, path, label)
     try:
         with without_warnings():
             if text is None:
-                return mujoco.MjSpec.from_file(str(path))
-            name = f"{uuid4().hex}{Path(path).suffix}"  # of a file that is not there
-            return mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: text.encode()})
+                spec = mujoco.MjSpec.from_file(str(path))
+            else:
+                name = f"{uuid4().hex}{Path(path).suffix}"  # of a file that is not there
+                spec = mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: text.encode()})
     except _FAILURES as error:
         raise _unreadable(path, error) from error
+    return Parsed(spec, repair(spec, is_urdf=own.root == "robot", thin=thin), own)
 
 
 def compiled_file(path: str | Path, text: str | None = None, *, bare: bool = False) -> Any:
@@ -219,7 +252,7 @@ def compiled_file(path: str | Path, text: str | None = None, *, bare: bool = Fal
     ModelError
         The file cannot be read or compiled.
     """
-    spec = parsed(path, text)
+    spec = parsed(path, text).spec
     if bare:
         drop_shapes(spec)
     return _compiled(path, spec)
@@ -232,7 +265,7 @@ def _compiled(path: str | Path, spec: Any) -> Any:
         with without_warnings():
             return spec.compile()
     except _FAILURES as error:
-        raise _unreadable(path, error) from error
+        raise _missing_mesh(path, spec, error) or _unreadable(path, error) from error
 
 
 def read_description(path: str | Path, base: str | None = None) -> Description:
@@ -260,7 +293,8 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
 
 def _description(path: str | Path, base: str | None) -> Description:
     """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
-    label, spec = f'robot description "{path}"', parsed(path)
+    label, file = f'robot description "{path}"', parsed(path)
+    spec = file.spec
     drives = _drive_limits(spec)
     drop_shapes(spec)
     model = _compiled(path, spec)
@@ -270,7 +304,14 @@ def _description(path: str | Path, base: str | None) -> Description:
     found = described(label, model, drives, re.sub(r"\W+", "-", spec.modelname) or Path(path).stem)
     if not found.joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
-    return replace(found, base=_measured_base(label, found)) if base == "measured" else found
+    flaws = {body.id - 1: flaw for body, flaw in file.flaws}
+    return replace(
+        found,
+        bodies=without_placeholders(found.bodies, flaws),
+        base=_measured_base(label, found) if base == "measured" else None,
+        flaws=flaws,
+        velocity_limits=file.outline.velocity_limits,
+    )
 
 
 def described(label: str, model: Any, drives: Mapping[str, tuple[float, float]], name: str) -> Description:
@@ -338,20 +379,43 @@ def _unreadable(path: str | Path, error: Exception) -> ModelError:
     return ModelError(f'robot description "{path}" cannot be read: {" ".join(str(error).split())}')
 
 
+def _missing_mesh(path: str | Path, spec: Any, error: Exception) -> ModelError | None:
+    """The error of a file of a mesh that is not there and gives a body its inertia; None for another error."""
+    missing = re.search(r"opening file '(.*?)'", str(error))
+    if missing is None:
+        return None
+    bodies = list(dict.fromkeys(shape.parent.name or "without a name" for shape in spec.geoms if shape.meshname))
+    named = ", ".join(bodies[:5]) + (f" and {len(bodies) - 5} more" if len(bodies) > 5 else "")
+    return ModelError(
+        f'robot description "{path}": the mesh file "{missing[1]}" does not exist, and bodies without an inertial have '
+        f"that of their meshes ({named}); give each an inertial in the description, or the file"
+    )
+
+
 def drop_shapes(spec: Any) -> None:
     """Remove looks, shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
     mujoco = mujoco_module()
     for element in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
         element.material = ""
-    _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.materials, spec.textures)
+    _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.lights, spec.materials, spec.textures)
     spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE  # lengths of muscles, which MuJoCo simulates
-    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
-        return
     wrapped = {x.target.name for tendon in spec.tendons for x in getattr(tendon, "path", ())}
-    needless = [x for x in spec.geoms if x.parent.explicitinertial or x.parent.name == "world"]
-    _delete(spec, [shape for shape in needless if shape.name not in wrapped])
-    if not list(spec.geoms):
-        _delete(spec, spec.meshes, spec.hfields)
+    _delete(spec, [shape for shape in spec.geoms if shape.name not in wrapped and not _counts(spec, shape)])
+    needed = {name for shape in spec.geoms for name in (shape.meshname, shape.hfieldname)}
+    _delete(spec, [x for x in (*spec.meshes, *spec.hfields) if x.name not in needed])
+
+
+def _counts(spec: Any, shape: Any) -> bool:
+    """Whether a shape gives its body an inertia that has an effect."""
+    rule, body = spec.compiler.inertiafromgeom, shape.parent
+    if body.explicitinertial and rule != mujoco_module().mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return False
+    return gives_inertia(spec, shape) and (_moves(body) or spec.compiler.settotalmass > 0.0)  # which scales all masses
+
+
+def _moves(body: Any) -> bool:
+    """Whether joints move a body of MuJoCo's editable form."""
+    return body.parent is not None and (bool(list(body.joints)) or _moves(body.parent))
 
 
 def _delete(spec: Any, *groups: Iterable[Any]) -> None:

@@ -15,6 +15,7 @@ from diransac.errors import ModelError
 from diransac.model.model import Model
 from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
+from diransac.model.robots.inertias import moving_bodies, notes_on_inertias, with_unknown
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
 from diransac.model.robots.reference import check_forces
 from diransac.model.robots.rigid_body import position_of
@@ -32,6 +33,7 @@ def robot(
     stribeck_speed: float = 0.2,
     gravity: Sequence[float] | None = None,
     base: str | None = None,
+    inertia: str = "nearest",
 ) -> Model:
     """Model of a robot from its description: chains and trees of hinges and slides on a base that is fixed or measured.
 
@@ -73,18 +75,22 @@ def robot(
         A base with a free joint: "held" in the pose of the file, of a robot that hangs or is clamped; or "measured",
         with further inputs ``base_wx``, ... (angular velocity), ``base_wx_dot``, ... (angular acceleration) and
         ``base_fx``, ... (acceleration of its origin less gravity, which an accelerometer shows), all in its frame.
+    inertia : {"nearest", "strict"}, optional
+        Of a body that moves, is not in ``bodies``, and has an inertia that no body can have (zero, not positive
+        definite, A + B < C), or no mass: the nearest possible one, or an error.
 
     Returns
     -------
     Model
-        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's.
+        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's, those of
+        unknown bodies with an impossible inertia a ball's; `Model.notes` name bodies with impossible inertias.
         `independent_parts` splits it into its limbs.
 
     Raises
     ------
     ModelError
         MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown;
-        nothing is unknown, or a body with unknown parameters does not move.
+        nothing is unknown, or a body with unknown parameters does not move; nothing that a joint moves has a mass.
 
     References
     ----------
@@ -92,6 +98,8 @@ def robot(
     """
     if base not in (None, "held", "measured"):
         raise ModelError(f'base is {base!r}; give "held" or "measured", or None')
+    if inertia not in ("nearest", "strict"):
+        raise ModelError(f'inertia is {inertia!r}; give "nearest" or "strict"')
     description = read_description(path, base)
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity, "gravity"))
@@ -101,15 +109,19 @@ def robot(
     moved = set(coordinates.values())
     for coupling in ordered_couplings(label, description):
         moved |= {coupling.follower} if coupling.leader in moved else set()
+    chosen = _bodies(description, bodies, moved)
+    notes = notes_on_inertias(label, description, moved, chosen, strict=inertia == "strict")
     mechanism = Mechanism(
         label=label,
-        description=description,
+        description=with_unknown(description, chosen),
         coordinates=coordinates,
         unknown=_known_names("unknown", unknown, UNKNOWN),
-        bodies=_bodies(description, bodies, moved),
+        bodies=chosen,
         speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
     )
-    return mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+    model = mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+    model.notes = notes
+    return model
 
 
 def robot_limits(
@@ -119,7 +131,7 @@ def robot_limits(
     joints: Collection[str] | Mapping[str, str] | str | None = None,
     base: str | None = None,
 ) -> dict[str, tuple[float, float]]:
-    """Ranges of joints and of the forces of their drives in a robot's description, for `diransac.design_experiment`.
+    """Ranges of joints, their speeds and the forces of their drives, for `diransac.design_experiment`.
 
     Parameters
     ----------
@@ -133,9 +145,9 @@ def robot_limits(
     Returns
     -------
     dict of str to (float, float)
-        By coordinate, ``elbow``, in rad or m, and by force of the drive, ``elbow_torque``, in N m or N (as
-        `drive_forces`). What the file does not limit on both sides is left out. MuJoCo does not read velocity limits
-        of URDF.
+        By coordinate, ``elbow``, in rad or m, by speed, ``elbow_dot``, in rad/s or m/s (URDF; one of zero is none), and
+        by force of the drive, ``elbow_torque``, in N m or N (as `drive_forces`). What the file does not limit on both
+        sides is left out.
 
     Raises
     ------
@@ -147,7 +159,9 @@ def robot_limits(
     for name, joint in ((n, description.joints[k]) for n, k in chosen.items()):
         own = np.inf if actuation is None else actuation.largest_force(name)
         low, high = joint.force_limits
-        found |= {name: joint.position_limits, FORCE.format(name): (max(low, -own), min(high, own))}
+        speed = description.velocity_limits.get(joint.name, np.inf)
+        found |= {name: joint.position_limits, f"{name}_dot": (-speed, speed)}
+        found[FORCE.format(name)] = max(low, -own), min(high, own)
     return {name: pair for name, pair in found.items() if np.isfinite(pair).all()}
 
 
@@ -301,11 +315,7 @@ def _coordinates(
 def _bodies(description: Description, bodies: Collection[str] | str, moved: Collection[int]) -> tuple[int, ...]:
     """Indices of bodies by name; of "all", those with one of the moved joints between them and the world."""
     if bodies == "all":
-        moving = set[int]()
-        for i, body in enumerate(description.bodies):
-            if body.parent in moving or set(body.joints) & set(moved):
-                moving.add(i)
-        return tuple(sorted(moving))
+        return moving_bodies(description, moved)
     names = [body.name for body in description.bodies]
     return tuple(names.index(name) for name in _known_names("bodies", bodies, names))
 

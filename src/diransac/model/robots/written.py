@@ -79,6 +79,8 @@ def differences(meant: Any, found: Any) -> dict[Entry, tuple[float, float]]:
         if own.shape != other.shape:
             raise ValueError(f"{name} has the shape {other.shape} in place of {own.shape}")
         size = np.abs(own) + np.abs(other) + 1e-9 * np.abs(own).max(initial=0.0)
+        if name == "body_inertia":  # whose entries are turned together
+            size = size + 1e-4 * np.abs(own).max(axis=1, keepdims=True)
         for at in np.argwhere(~((np.abs(own - other) <= _SAME * size) | (own == other))):
             index = tuple(at.tolist())
             off[name, index] = float(own[index]), float(other[index])
@@ -106,7 +108,9 @@ def _tensor(compiled: Any, k: int) -> FloatArray:
     return np.array([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])
 
 
-def written(path: str | Path, document: Document, meant: Any, *, bare: bool = False) -> str:
+def written(
+    path: str | Path, document: Document, meant: Any, *, bare: bool = False, repaired: Collection[int] = ()
+) -> str:
     """Text of a description that MuJoCo compiles to a model.
 
     Parameters
@@ -119,6 +123,8 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
         What `compiled_file` makes of the description, with other values; `refresh` was called.
     bare : bool, optional
         Without shapes, as in `compiled_file`.
+    repaired : collection of int, optional
+        Indices of bodies whose inertia in the file is impossible, in MuJoCo's order; theirs are written.
 
     Raises
     ------
@@ -126,6 +132,8 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
         An element is in another file; or the text compiles to other values whatever is written: it names the first.
     """
     writer = _Writer(document, meant)
+    for k in repaired:
+        writer.write_inertial(k, meant)
     for _ in range(_ROUNDS):
         text = document.text()
         found = compiled_file(path, text, bare=bare)
