@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, long_runs, runs
+from diransac.arrays import BoolArray, FloatArray, bulk_range, long_runs, runs
 from diransac.data import preprocessing
 from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.log import Log
@@ -248,17 +248,6 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     return Segment(
         model, log, offset, signals, measured[offset:], inputs[offset:], valid[offset:], notes, gaps[offset:]
     )
-
-
-def bulk_range(values: FloatArray) -> tuple[float, float]:
-    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0, 0.0
-    low, high = np.quantile(finite, [0.1, 0.9])
-    width = high - low
-    kept = finite[(finite >= low - width) & (finite <= high + width)]
-    return float(kept.min()), float(kept.max())
 
 
 def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolArray:

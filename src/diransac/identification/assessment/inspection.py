@@ -228,6 +228,7 @@ def inspect(
 
 def _contents(log: Log, model: Model | None) -> Inspection:
     """Statistics of one log."""
+    log = log if model is None else preprocessing.in_degrees(log, model)
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}

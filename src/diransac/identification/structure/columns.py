@@ -96,7 +96,7 @@ def mistakes_of_columns(dataset: Dataset, *, delays: bool = True) -> tuple[list[
         return certain, 0
     try:
         model = dataset.model.with_sensors(())
-        parts = [_middle(log) for log in dataset.given]
+        parts = [_middle(in_units(log, dataset.model)) for log in dataset.given]
         complete = all(set(model.required_signals) <= set(log.signals) for log in parts)
         derived = Dataset.of(model, parts if complete else [differentiate(x, model) for x in parts], pointwise=True)
         return explanations(CorrectionTests(model, derived.layout, motion_rows(derived), delays), dataset.given)
@@ -189,7 +189,7 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     wrapped = wraps(model, logs)
     if wrapped:
         return wrapped
-    prepared = [continuous(in_units(_middle(log).measured, model), model) for log in logs]
+    prepared = [continuous(_middle(in_units(log.measured, model)), model) for log in logs]
     ratios = list(_ratios(model, prepared))
     clocks = {unit: conversion(unit, "s") or 1.0 for unit in ("ms", "us")}
     slow = [u for u, x in clocks.items() if ratios and all(_is_near(r.ratio, x**r.order) for r in ratios)]

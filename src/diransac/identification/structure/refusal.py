@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diransac.arrays import FloatArray, robust_std
+from diransac.arrays import FloatArray, bulk_range, robust_std
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, ParameterLayout
-from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import (
     MotionRows,

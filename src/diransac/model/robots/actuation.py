@@ -196,6 +196,24 @@ def drive_forces(actuation: Actuation, joints: Collection[str]) -> Callable[...,
     return outputs
 
 
+def targets_among(drives: Mapping[str, Mapping[str, str]], units: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Coordinate by the name of each input that is its target, or that of its velocity.
+
+    Parameters
+    ----------
+    drives : mapping of str to mapping of str to str
+        Inputs of each joint's drive, with units.
+    units : mapping of str to (str, str)
+        Units of each joint's position and force.
+    """
+    return {
+        name: joint
+        for joint, own in drives.items()
+        for name, unit in own.items()
+        if unit in (units[joint][0], f"{units[joint][0]}/s")
+    }
+
+
 def _of_joint(what: str, value: PerJoint, joint: str) -> float:
     """Value of a setting for a joint.  Raises ModelError: there is none."""
     if not isinstance(value, Mapping):
