@@ -20,7 +20,7 @@ from diransac.identification.evaluation.scoring import choose_scoring
 from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.regression.uncertainty import jackknife_covariance
 from diransac.identification.settings import Settings
-from diransac.identification.structure.columns import contradictions
+from diransac.identification.structure.columns import contradictions, reversed_signs
 from diransac.identification.structure.identifiability import equations_in_words, in_words, of_log
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
@@ -299,7 +299,7 @@ def _fitness(logs: Sequence[Log], model: Model, contents: Sequence[Inspection]) 
         except (LogError, IdentificationError) as error:
             reason = str(error)
     if excitation and not reason:
-        caveats = [f"{x.claim}; {x.action}" for x in contradictions(model, logs)]
+        caveats = [f"{x.claim}; {x.action}" for x in contradictions(model, logs) or reversed_signs(model, logs)]
         spiked = [n for n in model.required_signals if any(n in x.signals and x.signals[n].n_spikes for x in contents)]
         if spiked:
             bias = f"spikes in {', '.join(spiked)} bias these estimates and errors"
