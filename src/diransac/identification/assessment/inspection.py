@@ -14,7 +14,7 @@ from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, as_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.data.segment import spelling_notes
+from diransac.data.segment import other_drive, spelling_notes
 from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.identification.evaluation.scoring import choose_scoring
 from diransac.identification.regression.estimators import OrdinaryLeastSquares
@@ -289,7 +289,7 @@ def _fitness(logs: Sequence[Log], model: Model, contents: Sequence[Inspection]) 
     excitation, reason, caveats = dict[str, Excitation](), "", list[str]()
     if derivable != missing:
         later = "lo-diransac estimates them; excitation is known only after identification"
-        reason = "" if set(missing) & set(model.inputs) else later
+        reason = other_drive(model, logs[0]) if set(missing) & set(model.inputs) else later
     elif model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)
         reason = f"not affine in {names}: excitation is known only after identification"

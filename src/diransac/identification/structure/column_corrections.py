@@ -262,7 +262,7 @@ def explained(tests: CorrectionTests) -> tuple[list[CorrectedEquations], int]:
         Number of corrections that were tested.
     """
     tested = [tests.of(x) for x in corrections(tests.model)]
-    accepted = _accepted(tests, [*tested, *_several_signs(tests)])
+    accepted = _accepted(tests, [*tested, *_several_signs(tests, tests.without)])
     if not accepted and tests.delays:
         accepted = _accepted(tests, list(_delays(tests)))
     return accepted, len(tested)
@@ -282,6 +282,9 @@ def reversed_drives(tests: CorrectionTests) -> list[CorrectedEquations]:
     if not found:
         return []
     forces = tests.of(Correction(tuple(drives[i] for i in found), factor=-1.0))
+    # Shared parameters show a sign that many parameters of one equation hide.
+    for more in _several_signs(tests, forces):
+        forces = more if forces.improved_by(more).any() else forces
     if model.n_q < model.n_v:
         return [forces]
     motion = tests.of(Correction(tuple(list(model.coordinates)[i] for i in found), factor=-1.0))
@@ -368,9 +371,8 @@ def corrections(model: Model) -> Iterator[Correction]:
         yield Correction(kelvin, "degC", offset=273.15)
 
 
-def _several_signs(tests: CorrectionTests) -> Iterator[CorrectedEquations]:
+def _several_signs(tests: CorrectionTests, best: CorrectedEquations) -> Iterator[CorrectedEquations]:
     """Signs of more and more inputs, each that with which fewer parameters are outside of their bounds."""
-    best = tests.without
     while best.outside:
         names = best.correction.names
         more = [tests.of(Correction((*names, n), factor=-1.0)) for n in tests.model.inputs if n not in names]
