@@ -383,7 +383,7 @@ def of_base(machine: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
 REASONS = (
     r"[a-z ()]+ of (?:tendon|joint|body|actuator)(?= \")", "density", "viscosity", "springyield", "kinematic loop",
     "friction of a tendon", "nothing can move", "nothing is unknown", "follows two others", "in a circle",
-    "follow each other", "gravity compensation on a base", "mass and inertia of moving bodies", "cannot be scaled",
+    "follow each other", "gravity compensation on a base", "moves has a mass", "cannot be scaled",
     "no joint is modelled", "there are no joints",
 )  # fmt: skip
 

@@ -327,7 +327,13 @@ def test_descriptions_without_equations_here_are_refused(described, old, new, me
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"unknown": ["inertia"]}, "unknown: there is no 'inertia'; choose from armature, damping"),
+        ({"unknown": ["inertial"]}, "unknown: there is no 'inertial'; choose from armature, damping"),
+        *(
+            ({"unknown": ["damping", name]}, rf'\'{name}\' belongs to bodies: .* \(--bodies\), "all" or some of link0')
+            for name in ("mass", "inertia", "com", "mass_hand", "Ixx_hand", "hx")
+        ),
+        ({"unknown": ["body/hand.mass"]}, r"'body/hand.mass' is a mask: .*\(--simulator mujoco\)"),
+        ({"unknown": ["kp"]}, "'kp' is a gain of a drive: where .* give 1, and the unknown \"torque_gain\""),
         ({"unknown": []}, "nothing is unknown"),
         ({"joints": ["elbow"]}, "joints: there is no 'elbow'; choose from joint1"),
         ({"joints": []}, "no joint is modelled"),
@@ -443,6 +449,8 @@ def test_an_encoder_bias_moves_the_mechanism_but_not_the_control(described):
         (lambda: dr.PositionControl(kp=1.0, target="target"), "target is 'target'; give a pattern"),
         (lambda: dr.MotorCurrents(constant={"a": 0.0}), "constant is 0; give a positive number"),
         (lambda: dr.JointTorques(limit="large"), "limit is 'large'; give a number"),
+        (lambda: dr.MotorCurrents(constant=None), "constant is None; where the constant is not known, give 1, and"),
+        (lambda: dr.PositionControl(kp=None), 'kp is None; where the kp is not known, give 1, and the unknown "torq'),
     ],
 )
 def test_drives_without_meaning_are_refused(make, message):

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diransac.arrays import FloatArray, robust_std
+from diransac.arrays import FloatArray, bulk_range, robust_std
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, ParameterLayout
-from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import (
     MotionRows,
@@ -26,7 +25,7 @@ from diransac.identification.regression.rows import (
 )
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.structure.column_corrections import CorrectionTests
-from diransac.identification.structure.columns import explanations
+from diransac.identification.structure.columns import explanations, reversed_signs
 from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
 from diransac.identification.structure.structural import Ranges, structural
 from diransac.model import Model
@@ -171,6 +170,18 @@ def _no_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[Motion
     cause = f"{', '.join(zero)} {verb} zero throughout" if zero else "each known term is zero throughout"
     advice = f"record known forces, or fix one, {every.remedy()}"
     return every.sentence(f"b = 0 in each row of W p = b, since {cause}: {every.determined()}; {advice}")
+
+
+def check_drives(dataset: Dataset) -> None:
+    """Raise IdentificationError if the forces of drives are reversed, before anything is searched.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    """
+    mistakes = reversed_signs(dataset.model, dataset.given)
+    if mistakes:
+        raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")
 
 
 def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:

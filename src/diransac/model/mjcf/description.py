@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -204,6 +204,36 @@ def file_drives(compiled: Any, taken: Collection[str]) -> dict[str, str]:
         name = f"{name}_ctrl" if name in taken else name
         inputs |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
     return inputs
+
+
+def position_targets(compiled: Any, inputs: Sequence[str]) -> dict[str, str]:
+    """Coordinate by the name of each input that is the target of its position: ``force = kp (target - q) - ...``.
+
+    Parameters
+    ----------
+    compiled : mujoco.MjModel
+    inputs : sequence of str
+        Names in the order of MuJoCo's controls.
+    """
+    on_joint, found = mujoco_module().mjtTrn.mjTRN_JOINT, dict[str, str]()
+    if len(compiled.actuator_trntype) != len(inputs):  # an actuator has several controls
+        return found
+    for k in range(len(inputs)):
+        kp, kq = compiled.actuator_gainprm[k][0], compiled.actuator_biasprm[k][1]
+        if compiled.actuator_trntype[k] == on_joint and compiled.actuator_gear[k][0] == 1.0 and kp == -kq > 0.0:
+            found[inputs[k]] = identifier(compiled.joint(compiled.actuator_trnid[k][0]).name)
+    return found
+
+
+def joint_ranges(compiled: Any) -> dict[str, tuple[float, float]]:
+    """Range of each hinge and slide that the file limits, in rad or m."""
+    kinds = mujoco_module().mjtJoint
+    one_axis = np.isin(compiled.jnt_type, [kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE])
+    limited = np.flatnonzero(one_axis & (compiled.jnt_limited != 0) & (np.ptp(compiled.jnt_range, axis=1) > 0.0))
+    return {
+        identifier(compiled.joint(k).name or f"joint_{k}"): tuple(compiled.jnt_range[k].tolist())
+        for k in limited.tolist()
+    }
 
 
 def activations(compiled: Any, taken: Collection[str]) -> dict[str, str]:

@@ -22,7 +22,7 @@ from diransac.model.derivation import Symbols
 from diransac.model.held import HeldConstant
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
-from diransac.model.robots.actuation import Actuation
+from diransac.model.robots.actuation import Actuation, targets_among
 from diransac.model.robots.description import Coupling, Description, Joint
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters, inverse_dynamics, pseudo_inertia
 
@@ -93,14 +93,18 @@ class Mechanism:
             return [ca.cse(ca.vertcat(*forces.values()))]
 
         units = {n: ("rad", "N m") if self._joint(n).turns else ("m", "N") for n in self.coordinates}
+        drives = {n: actuation.inputs(n, units[n]) for n in driven}
+        limits = {n: self._joint(n).position_limits for n in self.coordinates}
         model = Model(
             name=self.description.name,
             description=f"robot with {len(units)} joints, from its description",
             coordinates={n: position for n, (position, _) in units.items()},
-            inputs={key: unit for n in driven for key, unit in actuation.inputs(n, units[n]).items()}
+            inputs={name: unit for own in drives.values() for name, unit in own.items()}
             | {n: unit for names, unit in zip(self._base_inputs, _BASE.values(), strict=False) for n in names},
             parameters=self.parameters(driven),
             equations=equations,
+            ranges={n: x for n, x in limits.items() if np.isfinite(x).all() and x[0] < x[1]},
+            targets=targets_among(drives, units),
         )
         model.held_by = self.held
         return model
