@@ -117,7 +117,8 @@ class Prospects:
         """What to do about parameters outside of their bounds, as a clause."""
         inputs = listed(list(dict.fromkeys(x for n in names for x in self._inputs_of(n))))
         if inputs:
-            return f"check the signs and units of {inputs}, which they multiply"
+            multiply = "it multiplies" if len(names) == 1 else "they multiply"
+            return f"check the signs and units of {inputs}, which {multiply}"
         return f"{ADVICE}, or fix one, {Ambiguity(tuple(names), 0, ()).remedy()}"
 
     def _weak(self) -> list[str]:
