@@ -173,7 +173,12 @@ def test_a_mask_that_names_nothing_is_refused(hopper_file: Path, masks: list[str
         (
             '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>'
             '<motor name="slow" joint="j" delay="0.01" nsample="6"/></actuator></mujoco>',
-            "states besides positions, velocities and activations",
+            "has states of delays (delay, nsample), which are not simulated",
+        ),
+        (
+            '<mujoco><worldbody><body><joint name="j" stiffness="5" springyield=".2"/><geom size=".1"/></body>'
+            "</worldbody></mujoco>",
+            "has states of springs that yield (springyield)",
         ),
     ],
 )

@@ -39,8 +39,8 @@ def file_and_name(text: str, default: str) -> tuple[Path, str] | None:
 
 
 def is_description(text: str) -> bool:
-    """True for the name of a robot's description, ``.xml``, ``.mjcf`` or ``.urdf``."""
-    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf")
+    """True for the name of a robot's description; one in Xacro or SDF is refused with what to do where it is read."""
+    return Path(text).suffix.lower() in (".xml", ".mjcf", ".urdf", ".xacro", ".sdf")
 
 
 def definitions(file: Path, what: str) -> Mapping[str, object]:

@@ -312,7 +312,7 @@ class _Task:
             ),
             evaluation=evaluation,
             logs=_summaries(dataset, evaluation, named, predictions(estimate, evaluation, dataset)),
-            notes=(*unused, *dataset.notes, *estimate.notes, *scoring.notes, *incomparable),
+            notes=(*known.model.notes, *unused, *dataset.notes, *estimate.notes, *scoring.notes, *incomparable),
             fixed=tuple(n for n in known.model.parameters if n in known.fixed),
             priors=dict(known.priors),
         )

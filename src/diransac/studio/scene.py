@@ -131,7 +131,7 @@ def _compiled(model: str, path: str | None, roots: list[str]) -> Any:
         if model.replace("_", "-") not in known:
             raise ModelError("there is no drawing of this model")
         return mujoco.MjSpec.from_string(known[model.replace("_", "-")]).compile()
-    spec = _with_visuals(mujoco, path, parsed(path))
+    spec = _with_visuals(mujoco, path, parsed(path).spec)
     for unused in (spec.materials, spec.textures, spec.skins, spec.keys):
         for element in list(unused):
             spec.delete(element)
@@ -169,6 +169,8 @@ def _draw_links(mujoco: Any, spec: Any) -> None:
 
 def _with_visuals(mujoco: Any, path: str, spec: Any) -> Any:
     """The description with the visual shapes of a URDF file, which MuJoCo drops unless the file says otherwise."""
+    from diransac.model.robots.inertias import repair
+
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     if not re.search(r"<robot\b", text):
         return spec
@@ -182,6 +184,7 @@ def _with_visuals(mujoco: Any, path: str, spec: Any) -> Any:
     except (ValueError, RuntimeError):
         return spec
     found.modelfiledir = str(Path(path).parent)
+    repair(found, is_urdf=True)
     return found
 
 

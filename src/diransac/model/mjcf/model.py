@@ -17,6 +17,8 @@ from diransac.model.mjcf.description import (
     compiled_text,
     file_drives,
     joint_columns,
+    joint_ranges,
+    position_targets,
     sensor_columns,
 )
 from diransac.model.mjcf.masks import Unknown, unknowns_of
@@ -73,20 +75,24 @@ def mujoco(
     Raises
     ------
     ModelError
-        MuJoCo is not installed; the file cannot be read, or has what is not simulated here; a mask matches nothing.
+        MuJoCo is not installed; the file cannot be read, or has what is not simulated here; a mask matches nothing;
+        nothing that a joint moves has a mass. Inertias that no body can have are the nearest possible ones
+        (`Model.notes`).
 
     References
     ----------
     Todorov, Erez, Tassa 2012 (MuJoCo).
     """
-    text, drives = compiled_text(path, actuation)
+    text, drives, notes = compiled_text(path, actuation)
     label = f'robot description "{path}"'
     compiled = compiled_of(label, text)
     states = [n for x in joint_columns(compiled) for n in (*x.coordinates, *x.velocities)]
     sensors = list(sensor_columns(compiled, states))
     unknowns = unknowns_of(label, compiled, sensors, (unknown,) if isinstance(unknown, str) else tuple(unknown))
     inputs = file_drives(compiled, states) if drives is None else drives
-    return MujocoModel(name or identifier(Path(path).stem), text, unknowns, inputs)
+    model = MujocoModel(name or identifier(Path(path).stem), text, unknowns, inputs)
+    model.notes = notes
+    return model
 
 
 class MujocoModel(Model):
@@ -138,6 +144,8 @@ class MujocoModel(Model):
         self._name_signals(name, *groups, "", taken)
         names = [*(n for x in joints for n in x.accelerations), *(f"{n}_dot" for n in first_order)]
         self.accelerations = dict(zip(names, self.accelerations.values(), strict=True))
+        targets = position_targets(compiled, list(inputs))
+        self._name_ranges(joint_ranges(compiled), {n: q for n, q in targets.items() if q in coordinates})
 
     # ------------------------------------------------------------------ what the simulator reads
 
@@ -275,7 +283,7 @@ class MujocoModel(Model):
         if len(kept) == len(self.sensors):
             return self
         left = [x for x in self.unknowns if not x.columns or set(x.columns) & set(kept)]
-        return MujocoModel(self.name, self.text, left, self.inputs, constants=self.constants, sensors=kept)
+        return self._reduced(left, self.constants, kept)
 
     def with_fixed(self, values: Mapping[str, float]) -> MujocoModel:
         """The model in which parameters are constants."""
@@ -283,8 +291,14 @@ class MujocoModel(Model):
             return self
         fixed = [(x, float(values[x.name])) for x in self.unknowns if x.name in values]
         left = [x for x in self.unknowns if x.name not in values]
-        constants, sensors = (*self.constants, *fixed), self._given_sensors
-        return MujocoModel(self.name, self.text, left, self.inputs, constants=constants, sensors=sensors)
+        return self._reduced(left, (*self.constants, *fixed), self._given_sensors)
+
+    def _reduced(
+        self, unknowns: Sequence[Unknown], constants: Sequence[tuple[Unknown, float]], sensors: Collection[str] | None
+    ) -> MujocoModel:
+        model = MujocoModel(self.name, self.text, unknowns, self.inputs, constants=constants, sensors=sensors)
+        model.notes = self.notes
+        return model
 
     # ------------------------------------------------------------------ identity and storage
 

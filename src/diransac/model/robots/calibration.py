@@ -15,6 +15,7 @@ from diransac.model.robots.consistency import consistent_parameters, inconsisten
 from diransac.model.robots.description import Description, compiled_file, mujoco_module, read_description
 from diransac.model.robots.document import Document
 from diransac.model.robots.fields import FIELDS, places_of
+from diransac.model.robots.inertias import with_unknown
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
 from diransac.model.robots.written import refresh, written
 
@@ -79,7 +80,8 @@ def calibrated(
         for (n, x), value in zip(parameters.items(), values, strict=True)
         if np.isnan(value) or not (_has_inertials(dict(x.combination)) or x.combination[0][0] in placed)
     ]
-    return written(path, document, meant, bare=bare), tuple(left_out)
+    repaired = [i + 1 for i, flaw in description.flaws.items() if flaw.kind == "impossible"]
+    return written(path, document, meant, bare=bare, repaired=repaired), tuple(left_out)
 
 
 def impossible_changes(
@@ -132,6 +134,7 @@ def _estimates(
         return of_joints, {}
     every = list(places.values())
     names, constants, combinations = _combinations([every[k] for k in known])
+    description = with_unknown(description, [i for i, x in enumerate(description.bodies) if x.name in names])
     bodies, joints = {x.name: x for x in description.bodies}, {x.name: x for x in description.joints}
     missing = [name for name in names if name not in bodies]
     if missing:

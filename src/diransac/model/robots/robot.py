@@ -13,10 +13,17 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.model import Model
-from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
+from diransac.model.robots.actuation import FORCE, UNKNOWN_GAIN, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
+from diransac.model.robots.inertias import moving_bodies, notes_on_inertias, with_unknown
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
+from diransac.model.robots.reference import check_forces
 from diransac.model.robots.rigid_body import position_of
+from diransac.text_table import some
+
+_OF_BODIES = re.compile(r"(mass|inertia|com|ipos|cent(re|er)|payload|h[xyz]|i[xyz]{2})(_|$)", re.IGNORECASE)
+_OF_DRIVES = re.compile(r"(kp|kd|kv|kt|constant|gear|gain)(_|$)", re.IGNORECASE)
+"""Names that people give to parameters that are not those of joints."""
 
 
 def robot(
@@ -31,6 +38,7 @@ def robot(
     stribeck_speed: float = 0.2,
     gravity: Sequence[float] | None = None,
     base: str | None = None,
+    inertia: str = "nearest",
 ) -> Model:
     """Model of a robot from its description: chains and trees of hinges and slides on a base that is fixed or measured.
 
@@ -72,18 +80,22 @@ def robot(
         A base with a free joint: "held" in the pose of the file, of a robot that hangs or is clamped; or "measured",
         with further inputs ``base_wx``, ... (angular velocity), ``base_wx_dot``, ... (angular acceleration) and
         ``base_fx``, ... (acceleration of its origin less gravity, which an accelerometer shows), all in its frame.
+    inertia : {"nearest", "strict"}, optional
+        Of a body that moves, is not in ``bodies``, and has an inertia that no body can have (zero, not positive
+        definite, A + B < C), or no mass: the nearest possible one, or an error.
 
     Returns
     -------
     Model
-        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's.
+        One coordinate per joint, the reading of its encoder. Nominal values of its parameters are the file's, those of
+        unknown bodies with an impossible inertia a ball's; `Model.notes` name bodies with impossible inertias.
         `independent_parts` splits it into its limbs.
 
     Raises
     ------
     ModelError
         MuJoCo is not installed; the file cannot be read, or describes a closed loop or a ball joint; a name is unknown;
-        nothing is unknown, or a body with unknown parameters does not move.
+        nothing is unknown, or a body with unknown parameters does not move; nothing that a joint moves has a mass.
 
     References
     ----------
@@ -91,23 +103,30 @@ def robot(
     """
     if base not in (None, "held", "measured"):
         raise ModelError(f'base is {base!r}; give "held" or "measured", or None')
+    if inertia not in ("nearest", "strict"):
+        raise ModelError(f'inertia is {inertia!r}; give "nearest" or "strict"')
     description = read_description(path, base)
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity, "gravity"))
     label = f'robot "{path}"'
+    check_forces(label, description)
     coordinates = _coordinates(label, description, joints)
     moved = set(coordinates.values())
     for coupling in ordered_couplings(label, description):
         moved |= {coupling.follower} if coupling.leader in moved else set()
+    chosen = _bodies(description, bodies, moved)
+    notes = notes_on_inertias(label, description, moved, chosen, strict=inertia == "strict")
     mechanism = Mechanism(
         label=label,
-        description=description,
+        description=with_unknown(description, chosen),
         coordinates=coordinates,
-        unknown=_known_names("unknown", unknown, UNKNOWN),
-        bodies=_bodies(description, bodies, moved),
+        unknown=_unknown_of_joints(unknown, description),
+        bodies=chosen,
         speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
     )
-    return mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+    model = mechanism.model(actuation or JointTorques(), _known_names("passive", passive, mechanism.coordinates))
+    model.notes = notes
+    return model
 
 
 def robot_limits(
@@ -117,7 +136,7 @@ def robot_limits(
     joints: Collection[str] | Mapping[str, str] | str | None = None,
     base: str | None = None,
 ) -> dict[str, tuple[float, float]]:
-    """Ranges of joints and of the forces of their drives in a robot's description, for `diransac.design_experiment`.
+    """Ranges of joints, their speeds and the forces of their drives, for `diransac.design_experiment`.
 
     Parameters
     ----------
@@ -131,9 +150,9 @@ def robot_limits(
     Returns
     -------
     dict of str to (float, float)
-        By coordinate, ``elbow``, in rad or m, and by force of the drive, ``elbow_torque``, in N m or N (as
-        `drive_forces`). What the file does not limit on both sides is left out. MuJoCo does not read velocity limits
-        of URDF.
+        By coordinate, ``elbow``, in rad or m, by speed, ``elbow_dot``, in rad/s or m/s (URDF; one of zero is none), and
+        by force of the drive, ``elbow_torque``, in N m or N (as `drive_forces`). What the file does not limit on both
+        sides is left out.
 
     Raises
     ------
@@ -145,7 +164,9 @@ def robot_limits(
     for name, joint in ((n, description.joints[k]) for n, k in chosen.items()):
         own = np.inf if actuation is None else actuation.largest_force(name)
         low, high = joint.force_limits
-        found |= {name: joint.position_limits, FORCE.format(name): (max(low, -own), min(high, own))}
+        speed = description.velocity_limits.get(joint.name, np.inf)
+        found |= {name: joint.position_limits, f"{name}_dot": (-speed, speed)}
+        found[FORCE.format(name)] = max(low, -own), min(high, own)
     return {name: pair for name, pair in found.items() if np.isfinite(pair).all()}
 
 
@@ -264,6 +285,22 @@ def _known_names(what: str, given: Collection[str], known: Collection[str]) -> t
     return names
 
 
+def _unknown_of_joints(given: Collection[str], description: Description) -> tuple[str, ...]:
+    """Names of unknown parameters of joints.  Raises ModelError: one is unknown, or has its place elsewhere."""
+    for name in (given,) if isinstance(given, str) else given:
+        elsewhere = ""
+        if "/" in name:
+            elsewhere = "is a mask: dr.models.mujoco takes it (--simulator mujoco)"
+        elif _OF_BODIES.match(name):
+            bodies = some(body.name for body in description.bodies)
+            elsewhere = f'belongs to bodies: name these with bodies= (--bodies), "all" or some of {bodies}'
+        elif _OF_DRIVES.match(name):
+            elsewhere = f"is a gain of a drive: {UNKNOWN_GAIN.format('gain')}"
+        if elsewhere:
+            raise ModelError(f"unknown: {name!r} {elsewhere}; parameters of joints are {', '.join(UNKNOWN)}")
+    return _known_names("unknown", given, UNKNOWN)
+
+
 def _coordinates(
     label: str, description: Description, joints: Collection[str] | Mapping[str, str] | str | None
 ) -> dict[str, int]:
@@ -299,11 +336,7 @@ def _coordinates(
 def _bodies(description: Description, bodies: Collection[str] | str, moved: Collection[int]) -> tuple[int, ...]:
     """Indices of bodies by name; of "all", those with one of the moved joints between them and the world."""
     if bodies == "all":
-        moving = set[int]()
-        for i, body in enumerate(description.bodies):
-            if body.parent in moving or set(body.joints) & set(moved):
-                moving.add(i)
-        return tuple(sorted(moving))
+        return moving_bodies(description, moved)
     names = [body.name for body in description.bodies]
     return tuple(names.index(name) for name in _known_names("bodies", bodies, names))
 

@@ -110,7 +110,9 @@ def _tensor(compiled: Any, k: int) -> FloatArray:
     return np.array([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])
 
 
-def written(path: str | Path, document: Document, meant: Any, *, bare: bool = False) -> str:
+def written(
+    path: str | Path, document: Document, meant: Any, *, bare: bool = False, repaired: Collection[int] = ()
+) -> str:
     """Text of a description that MuJoCo compiles to a model.
 
     Parameters
@@ -123,6 +125,8 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
         What `compiled_file` makes of the description, with other values; `refresh` was called.
     bare : bool, optional
         Without shapes, as in `compiled_file`.
+    repaired : collection of int, optional
+        Indices of bodies whose inertia in the file is impossible, in MuJoCo's order; theirs are written.
 
     Raises
     ------
@@ -130,6 +134,8 @@ def written(path: str | Path, document: Document, meant: Any, *, bare: bool = Fa
         An element is in another file; or the text compiles to other values whatever is written: it names the first.
     """
     writer = _Writer(document, meant)
+    for k in repaired:
+        writer.write_inertial(k, meant)
     for _ in range(_ROUNDS):
         text = document.text()
         found = compiled_file(path, text, bare=bare)

@@ -1,0 +1,84 @@
+"""Text of a description, beside what MuJoCo reads of it: its format, and limits of velocities of a URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from diransac.errors import ModelError
+
+_REMEDIES = {
+    "sdf": "is SDF, which is not read here; give the URDF or MJCF of the robot",
+    "mujocoinclude": "is a part that MJCF files include; give the file that includes it",
+}
+
+
+@dataclass
+class Outline:
+    """What the text of a description says of itself.
+
+    Parameters
+    ----------
+    root : str
+        Name of the outermost element; empty for text that is no XML.
+    has_macros : bool
+        Whether there are elements or values of Xacro.
+    velocity_limits : dict of str to float
+        Of joints of a URDF, by name, rad/s or m/s; those that are positive.
+    """
+
+    root: str = ""
+    has_macros: bool = False
+    velocity_limits: dict[str, float] = field(default_factory=dict)
+
+
+def outline(path: str | Path) -> Outline:
+    """Outline of a description; of text that is no XML, up to where it is.
+
+    Parameters
+    ----------
+    path : str or Path
+        File that `check_description` lets pass.
+    """
+    found, joints = Outline(), [""]
+
+    def start(name: str, attributes: Mapping[str, str]) -> None:
+        found.root = found.root or name
+        if found.root == "robot":
+            found.has_macros |= name.startswith("xacro:") or any("${" in x for x in attributes.values())
+        if name == "joint":
+            joints[0] = attributes.get("name", "")
+        elif name == "limit" and found.root == "robot" and (limit := _positive(attributes.get("velocity", ""))):
+            found.velocity_limits[joints[0]] = limit
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    with suppress(expat.ExpatError, ValueError):  # of encodings that it does not know
+        parser.Parse(Path(path).read_bytes(), True)
+    return found
+
+
+def check_format(found: Outline, path: str | Path, label: str) -> None:
+    """Raise ModelError where a description is of a format that MuJoCo does not read, with what to do."""
+    if found.has_macros:
+        name = Path(path).name
+        target = name.removesuffix(".xacro").removesuffix(".urdf") + (
+            "-expanded.urdf" if name.endswith(".urdf") else ".urdf"
+        )
+        raise ModelError(f"{label} has macros of Xacro; expand them: xacro {name} > {target}")
+    if found.root in _REMEDIES:
+        raise ModelError(f"{label} {_REMEDIES[found.root]}")
+
+
+def _positive(text: str) -> float:
+    """The number in a text; 0 if it is none, or not positive and finite."""
+    try:
+        number = float(text)
+    except ValueError:
+        return 0.0
+    return number if 0.0 < number < np.inf else 0.0
