@@ -103,7 +103,7 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     with without_warnings():
         text = str(spec.to_xml())
     own = spec.compiler
-    if own.settotalmass > 0.0 or own.boundmass or own.boundinertia or own.balanceinertia:  # which it is yet without
+    if own.settotalmass > 0.0 or own.boundmass or own.boundinertia or own.balanceinertia:  # the text has some of these, and they act again
         text = with_inertials(Document(text.encode(), label), compiled)
     return text, drives, notes
 
