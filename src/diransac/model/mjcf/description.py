@@ -102,8 +102,8 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     compiled = compiled_of(label, spec)
     with without_warnings():
         text = str(spec.to_xml())
-    own = spec.compiler
-    if own.settotalmass > 0.0 or own.boundmass or own.boundinertia or own.balanceinertia:  # the text has some of these, and they act again
+    own = spec.compiler  # whose bounds would act again, on what is scaled
+    if own.settotalmass > 0.0 or own.boundmass or own.boundinertia or own.balanceinertia:
         text = with_inertials(Document(text.encode(), label), compiled)
     return text, drives, notes
 

@@ -12,7 +12,7 @@ from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
 from diransac.model.robots.consistency import consistent_parameters, inconsistency
-from diransac.model.robots.description import Description, compiled_file, mujoco_module, read_description
+from diransac.model.robots.description import Description, Joint, compiled_file, mujoco_module, read_description
 from diransac.model.robots.document import Document
 from diransac.model.robots.fields import FIELDS, places_of
 from diransac.model.robots.inertias import with_unknown
@@ -64,13 +64,13 @@ def calibrated(
         meant, bare = compiled_file(path), False
     except ModelError:  # files of meshes need not be there
         meant, bare = compiled_file(path, bare=True), True
-    joints = [x.name for x in description.joints]
     indices = [k for k in range(meant.njnt) if meant.jnt_type[k] != mujoco_module().mjtJoint.mjJNT_FREE]
+    joints = {joint.name: (k, joint) for k, joint in zip(indices, description.joints, strict=True)}
     for place in placed:
         kind, _, name = place.partition(" ")
         if name not in joints:
             raise ModelError(f'there is no joint "{name}" in the description')
-        _set_joint(document.label, meant, indices[joints.index(name)], _OF_MJCF[kind], of_joints[place])
+        _set_joint(document.label, meant, *joints[name], _OF_MJCF[kind], of_joints[place])
     for k, body in enumerate(description.bodies, 1):
         if body.name in of_bodies:
             _set_body(meant, k, of_bodies[body.name])
@@ -166,26 +166,16 @@ def _combinations(places: list[dict[str, float]]) -> tuple[list[str], list[str],
 # ---------------------------------------------------------------------- values in the compiled model
 
 
-def _set_joint(label: str, meant: Any, k: int, field: str, value: float) -> None:
+def _set_joint(label: str, meant: Any, k: int, joint: Joint, field: str, value: float) -> None:
     """Give a joint a value, of which actuators have a part of their own.  Raises ModelError: they have more."""
-    of_drives = _of_drives(meant, k, field)
+    of_drives = {"armature": joint.drive_armature, "damping": joint.drive_damping}.get(field, 0.0)
     if of_drives > value:
         raise ModelError(
-            f'{label}: {field} of joint "{meant.joint(k).name}" is {value:.6g}, but its actuators alone have '
+            f'{label}: {field} of joint "{joint.name}" is {value:.6g}, but its actuators alone have '
             f"{of_drives:.6g} behind their gears; lower {field} of the actuators in the file"
         )
     for place in places_of(meant, "joint", k, FIELDS["joint"][field].numbers[0]):
         getattr(meant, place.array)[place.index] = value - of_drives
-
-
-def _of_drives(meant: Any, k: int, field: str) -> float:
-    """What actuators add to the armature or damping of a joint, by the square of their gears (MuJoCo 3.7)."""
-    kinds, values = mujoco_module().mjtTrn, getattr(meant, f"actuator_{field}", None)
-    if values is None:
-        return 0.0
-    acts = np.isin(meant.actuator_trntype, (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT))
-    acts &= meant.actuator_trnid[:, 0] == k
-    return float(meant.actuator_gear[acts, 0] ** 2 @ values[acts])
 
 
 def _set_body(meant: Any, k: int, inertial: FloatArray) -> None:
