@@ -175,7 +175,8 @@ def _of_correction(tests: CorrectionTests, logs: Sequence[Log], accepted: Sequen
     if one.offset:
         return Mistake(what, f"with {them} plus {one.offset:g}, {why}", f"add {one.offset:g} to {listed(columns)}")
     if len(accepted) > 1:
-        what = f"The sign of {' or '.join(listed(x.correction.names) for x in accepted)} is reversed"
+        signs, are = ("sign", "is") if len(one.names) == 1 else ("signs", "are")
+        what = f"The {signs} of {' or '.join(listed(x.correction.names) for x in accepted)} {are} reversed"
     mended = [n for n in without.outside if n not in accepted[0].outside]
     if mended:
         values = dict(zip(tests.layout.names, without.parameters, strict=True))
