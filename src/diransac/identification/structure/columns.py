@@ -113,11 +113,13 @@ def reversed_signs(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     Parameters
     ----------
     model : Model
-        Without equations that are affine in its parameters, it has none.
+        Of a robot's description, affine in its parameters: others have none. Where little is known of a machine, its
+        controller's law, which has the other sign, may explain the force of its drive, too.
     logs : sequence of Log
         Derivatives may be missing.
     """
-    if not model.has_equations or model.nonlinear_parameters or not drives_of(model):
+    is_described = model.has_equations and any(x.combination for x in model.parameters.values())
+    if not is_described or model.nonlinear_parameters or not drives_of(model):
         return []
     try:
         with np.errstate(all="ignore"):  # equations that overflow prove nothing
