@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import diransac as dr
+from acceptance import random_machines
 from command_line import run
 from diransac.identification.assessment.inspection import inspect
 from diransac.identification.structure.columns import reversed_signs
@@ -107,3 +108,10 @@ def test_a_target_is_no_force(tmp_path):
     targets = {n.replace("torque", "target"): -x for n, x in columns.items()}
     log = dr.Log.from_arrays(t, columns | targets)
     assert reversed_signs(dr.models.robot(arm, actuation=dr.PositionControl(kp=20.0)), [log]) == []
+
+
+@pytest.mark.parametrize("seed", [528, 634])
+def test_a_machine_without_a_description_is_not_accused_before_its_fit(seed):
+    """A robust fit at another minimum, and the law of a controller, explain these with the other sign."""
+    machine = random_machines.machine(seed)
+    assert reversed_signs(random_machines.model_of(machine), [random_machines.log_of(machine)]) == []

@@ -175,16 +175,21 @@ class CorrectionTests:
         return CorrectedEquations(correction, parameters, np.maximum(residuals, EXACT), outside)
 
     def one_by_one(self, correction: Correction) -> FloatArray:
-        """Residuals ``(n_eq,)`` with a correction of equations that are affine, each with parameters of its own."""
+        """Residuals ``(n_eq,)`` with a correction of equations that are affine, each with parameters of its own.
+
+        The larger ones of those with bounds and without: with bounds, a robust fit may end at another minimum.
+        """
         parts, held = self._parts(correction, self.model)
         rows, finite = scaled_equations(self.model, self.layout, parts)
-        residuals = np.full(rows.b.shape[1], np.inf)
+        predicted, residuals = np.concatenate(held)[finite], np.full(rows.b.shape[1], np.inf)
+        low, high = inclusive_bounds(self.layout.bounds, zero=True)
         for i in range(len(residuals)):
             own = np.flatnonzero(rows.W[:, i].any(axis=0))
-            bounds = tuple(x[own] for x in inclusive_bounds(self.layout.bounds, zero=True))
             one = Rows(rows.W[:, i : i + 1, own], rows.b[:, i : i + 1])
-            found = _predicted(one, np.concatenate(held)[finite], (bounds[0], bounds[1]))
-            residuals[i] = np.inf if found is None else found[1][0]
+            found = _predicted(one, predicted, (low[own], high[own]))
+            if found is not None:
+                free = np.median(np.abs(one.residuals(found[0].p)[predicted]))
+                residuals[i] = max(found[1][0], free)
         return residuals
 
     def _parts(self, correction: Correction, model: Model) -> tuple[list[MotionRows], list[BoolArray]]:

@@ -113,11 +113,13 @@ def reversed_signs(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     Parameters
     ----------
     model : Model
-        Without equations that are affine in its parameters, it has none.
+        Of a robot's description, affine in its parameters: others have none. Where little is known of a machine, its
+        controller's law, which has the other sign, may explain the force of its drive, too.
     logs : sequence of Log
         Derivatives may be missing.
     """
-    if not model.has_equations or model.nonlinear_parameters or not drives_of(model):
+    is_described = model.has_equations and any(x.combination for x in model.parameters.values())
+    if not is_described or model.nonlinear_parameters or not drives_of(model):
         return []
     try:
         with np.errstate(all="ignore"):  # equations that overflow prove nothing
@@ -175,7 +177,8 @@ def _of_correction(tests: CorrectionTests, logs: Sequence[Log], accepted: Sequen
     if one.offset:
         return Mistake(what, f"with {them} plus {one.offset:g}, {why}", f"add {one.offset:g} to {listed(columns)}")
     if len(accepted) > 1:
-        what = f"The sign of {' or '.join(listed(x.correction.names) for x in accepted)} is reversed"
+        signs, are = ("sign", "is") if len(one.names) == 1 else ("signs", "are")
+        what = f"The {signs} of {' or '.join(listed(x.correction.names) for x in accepted)} {are} reversed"
     mended = [n for n in without.outside if n not in accepted[0].outside]
     if mended:
         values = dict(zip(tests.layout.names, without.parameters, strict=True))
