@@ -59,10 +59,13 @@ class Prospects:
 
     @cached_property
     def solution(self) -> RowsSolution | None:
-        """The parameters; None where they are not affine, or there is no finite row."""
-        if not self.rows or self.model.nonlinear_parameters:
+        """The parameters; None where they are not affine, priors add to the rows, or numbers exceed floating point."""
+        if not (self.rows and self.model.is_affine) or np.isfinite(self.layout.prior_std).any():
             return None
-        return solved(self.model, self.layout, self.rows)
+        try:
+            return solved(self.model, self.layout, self.rows)
+        except np.linalg.LinAlgError:
+            return None
 
     @cached_property
     def outside(self) -> list[str]:

@@ -220,13 +220,13 @@ class Contest:
         return [*found, *(replace(x, motion=motion) for x, motion in simulated)]
 
     def is_challenged(self, search: Searched, rival: Candidate) -> bool:
-        """True if a fit is exact although its noise is not white, or if a rival contradicts an estimate that counts.
+        """True if a fit is exact although its noise is not white, or if a rival contradicts its estimate.
 
         Two estimates contradict each other if their 95 % intervals of a parameter are disjoint.
         """
         errors = np.sqrt(np.diag(jackknife(rival.without))) + np.sqrt(np.diag(search.result.covariance))
         apart = np.abs(rival.parameters - search.result.parameters)
-        return search.likeliest.exact or bool((apart > 1.96 * errors).any() and search.likeliest.is_comparable)
+        return search.likeliest.exact or bool((apart > 1.96 * errors).any())
 
     def _searched_from(self, rival: Candidate, first: Searched | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""

@@ -378,7 +378,7 @@ def _gather(batches: list[list[FloatArray]], rows: FloatArray, first: int, lengt
 
 def _triangle(pieces: Sequence[FloatArray]) -> FloatArray:
     """Rows (c, c) with the squares and products of others (m, c): the triangle of a QR decomposition."""
-    found = np.asarray(np.linalg.qr(np.concatenate(pieces), mode="r"), float)
+    found = np.asarray(np.linalg.qr(np.concatenate(pieces), mode="r"))
     return np.pad(found, ((0, found.shape[1] - len(found)), (0, 0)))
 
 
