@@ -278,6 +278,25 @@ def test_other_formats_are_refused_with_what_to_do(described, name, text, messag
     assert message in done.stderr
 
 
+@pytest.mark.parametrize("name", ["arm.mjcf", "ARM.XML", "arm.xacro", "arm.urdf"])
+def test_files_are_read_whatever_their_ending(described, name):
+    expected = forces(described(chain(link("first")), "good.urdf"))
+    assert forces(described(chain(link("first")), name)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_inertials_of_urdf_may_be_incomplete(described):
+    inertial = '<inertial><origin xyz="0.01 0.02 -0.15"/><mass value="1.2"/></inertial>'
+    path = described(chain(f'<link name="first">{inertial}</link>', link("second")))
+    zero = described(chain(link("first", IMPOSSIBLE["zero"]), link("second")), "zero.urdf")
+    assert forces(path) == pytest.approx(forces(zero), abs=1e-12)
+    assert "nearest possible ones: first (it is zero)" in dr.models.robot(path).notes[0]
+    flywheel = link("first").replace('<mass value="1.2"/>', "")
+    assert (
+        "no mass in the file, and add none: first"
+        in dr.models.robot(described(chain(flywheel, link("second")))).notes[0]
+    )
+
+
 def test_meshes_matter_only_where_they_give_an_inertia_of_what_moves(described):
     mesh = '<collision><geometry><mesh filename="package://arm/meshes/{}.stl"/></geometry></collision>'
     visual = mesh.format("seen").replace("collision>", "visual>")

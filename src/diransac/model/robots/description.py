@@ -21,7 +21,7 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.limits import MOST_JOINTS, beyond
-from diransac.model.robots.formats import Outline, check_format, outline
+from diransac.model.robots.formats import Outline, check_format, outline, text_for_mujoco
 from diransac.model.robots.inertias import THIN, Flaw, gives_inertia, repair, without_placeholders
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
@@ -213,7 +213,10 @@ def parsed(path: str | Path, thin: float = THIN) -> Parsed:
     check_format(text, path, label)
     try:
         with without_warnings():
-            spec = mujoco.MjSpec.from_file(str(path))
+            content = text_for_mujoco(text, path)
+            spec = mujoco.MjSpec.from_file(str(path)) if content is None else mujoco.MjSpec.from_string(content)
+            if content is not None:
+                spec.modelfiledir = str(Path(path).parent)
     except _FAILURES as error:
         raise _unreadable(path, error) from error
     return Parsed(spec, repair(spec, is_urdf=text.root == "robot", thin=thin), text)

@@ -12,6 +12,10 @@ import numpy as np
 
 from diransac.errors import ModelError
 
+_NOTHING = {
+    "mass": '<mass value="0"/>',
+    "inertia": '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>',
+}
 _REMEDIES = {
     "sdf": "is SDF, which is not read here; give the URDF or MJCF of the robot",
     "mujocoinclude": "is a part that MJCF files include; give the file that includes it",
@@ -30,11 +34,14 @@ class Outline:
         Whether there are elements or values of Xacro.
     velocity_limits : dict of str to float
         Of joints of a URDF, by name, rad/s or m/s; those that are positive.
+    gaps : dict of int to str
+        What inertials of a URDF lack, a mass or an inertia of zero, by the place in the text, in bytes.
     """
 
     root: str = ""
     has_macros: bool = False
     velocity_limits: dict[str, float] = field(default_factory=dict)
+    gaps: dict[int, str] = field(default_factory=dict)
 
 
 def outline(path: str | Path) -> Outline:
@@ -45,7 +52,7 @@ def outline(path: str | Path) -> Outline:
     path : str or Path
         File that `check_description` lets pass.
     """
-    found, joints = Outline(), [""]
+    found, joints, parts = Outline(), [""], set[str]()
 
     def start(name: str, attributes: Mapping[str, str]) -> None:
         found.root = found.root or name
@@ -55,12 +62,36 @@ def outline(path: str | Path) -> Outline:
             joints[0] = attributes.get("name", "")
         elif name == "limit" and found.root == "robot" and (limit := _positive(attributes.get("velocity", ""))):
             found.velocity_limits[joints[0]] = limit
+        parts.add(name)
+        if name == "inertial":
+            parts.clear()
+
+    def end(name: str) -> None:
+        missing = "".join(text for part, text in _NOTHING.items() if part not in parts)
+        if name == "inertial" and found.root == "robot" and missing:
+            found.gaps[parser.CurrentByteIndex] = missing
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler = start
+    parser.StartElementHandler, parser.EndElementHandler = start, end
     with suppress(expat.ExpatError, ValueError):  # of encodings that it does not know
         parser.Parse(Path(path).read_bytes(), True)
     return found
+
+
+def text_for_mujoco(found: Outline, path: str | Path) -> str | None:
+    """Text of a description that MuJoCo would not read from its file; None where it would.
+
+    It reads files of two endings alone, and no inertial of a URDF without a mass or without an inertia.
+
+    Raises UnicodeDecodeError: the text is not UTF-8.
+    """
+    if Path(path).suffix in (".xml", ".urdf") and not found.gaps:
+        return None
+    source, parts, at = Path(path).read_bytes(), list[bytes](), 0
+    for place, text in found.gaps.items():
+        parts += [source[at:place], text.encode()]
+        at = place
+    return b"".join([*parts, source[at:]]).decode()
 
 
 def check_format(found: Outline, path: str | Path, label: str) -> None:
