@@ -144,16 +144,23 @@ def reference(file: Path) -> tuple[Any, bool]:
 
 
 def drop_meshes(spec: Any) -> None:
-    """Remove shapes of bodies with an inertial and what refers to them, so that files of meshes need not be there."""
+    """Remove shapes of bodies with an inertial, or that do not move: files of their meshes need not be there."""
     for element in (*spec.pairs, *spec.sensors, *spec.skins, *spec.lights, *spec.materials, *spec.textures):
         spec.delete(element)
-    for shape in [x for x in spec.geoms if x.parent.explicitinertial or not list(x.parent.joints)]:
+    for shape in [x for x in spec.geoms if x.parent.explicitinertial or not moves(x.parent)]:
         spec.delete(shape)
     for shape in (*spec.geoms, *spec.sites, *spec.tendons):
         shape.material = ""
     used = {name for x in spec.geoms for name in (x.meshname, x.hfieldname)}
     for mesh in [x for x in (*spec.meshes, *spec.hfields) if x.name not in used]:
         spec.delete(mesh)
+
+
+def moves(body: Any) -> bool:
+    """Whether a body, or one that bears it, has a joint."""
+    while body.parent is not None and not list(body.joints):
+        body = body.parent
+    return body.parent is not None
 
 
 def difference(model: dr.Model, compiled: Any) -> float:

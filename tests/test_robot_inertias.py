@@ -178,6 +178,16 @@ def test_a_link_without_a_mass_is_a_frame(described):
         dr.models.robot(path, inertia="strict")
 
 
+def test_a_link_without_a_mass_keeps_its_inertia(described):
+    path = described(chain(link("first", mass=0.0), link("second")))
+    text = chain(link("first", mass=0.0), link("second")).replace('<mass value="0.0"/>', '<mass value="1e-13"/>')
+    reference, data = compiled(described(text, "light.urdf"))
+    expected = [inverse(reference, data, *motion) for motion in motions(2)]
+    assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
+    alone = described(chain(link("first", mass=0.0)), "wheel.urdf")
+    assert forces(alone)[:, 0] == pytest.approx(GOOD[1] * motions(1)[:, 2, 0], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     "second", ['<link name="second"/>', link("second", [0.0] * 6, 0.0), link("second", GOOD, -1.0)]
 )

@@ -158,10 +158,15 @@ def _set_inertia(body: Any, I: FloatArray) -> None:
 
 
 def without_placeholders(bodies: tuple[Body, ...], flaws: Mapping[int, Flaw]) -> tuple[Body, ...]:
-    """The bodies, of which those that move without a mass have none again."""
-    nothing = np.zeros((4, 4))
+    """The bodies, of which those that move without a mass have none again; an inertia remains."""
+
+    def without_mass(J: FloatArray) -> FloatArray:
+        second = J - np.outer(J[:, 3], J[:, 3]) / J[3, 3]
+        return np.where(np.abs(second) > 2.0 * _LEAST, second, 0.0)
+
     is_massless = [i in flaws and flaws[i].kind == "massless" for i in range(len(bodies))]
-    return tuple(replace(x, inertial=nothing) if m else x for x, m in zip(bodies, is_massless, strict=True))
+    zipped = zip(bodies, is_massless, strict=True)
+    return tuple(replace(x, inertial=without_mass(x.inertial)) if massless else x for x, massless in zipped)
 
 
 def with_unknown(description: Description, unknown: Collection[int]) -> Description:
@@ -268,8 +273,8 @@ def _listed(flaws: Mapping[str, Flaw]) -> str:
 
 
 def _check_masses(label: str, description: Description, moved: Collection[int], unknown: Collection[int]) -> None:
-    """Raise ModelError where nothing that a joint moves has a mass."""
-    carries = [x.inertial[3, 3] > 0.0 or i in unknown for i, x in enumerate(description.bodies)]
+    """Raise ModelError where nothing that a joint moves has a mass or an inertia."""
+    carries = [bool(x.inertial.any()) or i in unknown for i, x in enumerate(description.bodies)]
     for i, body in reversed(list(enumerate(description.bodies))):
         carries[body.parent] |= body.parent >= 0 and carries[i]
     for i, body in enumerate(description.bodies):
