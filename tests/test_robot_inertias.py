@@ -275,6 +275,7 @@ def test_notes_of_a_model_are_in_inspections_and_results(described, tmp_path):
         ("arm.urdf.xacro", '<robot name="a"><xacro:leg/></robot>', "expand them: xacro arm.urdf.xacro > arm.urdf"),
         ("arm.urdf", '<robot name="a"><xacro:leg/></robot>', "expand them: xacro arm.urdf > arm-expanded.urdf"),
         ("arm.xacro", '<robot name="a"><link name="${n}"/></robot>', "expand them: xacro arm.xacro > arm.urdf"),
+        ("arm.urdf", '<robot name="a"><origin xyz="$(arg x) 0 0"/></robot>', "has macros of Xacro"),
         ("arm.sdf", '<sdf version="1.7"><model name="a"/></sdf>', "is SDF, which is not read here"),
         ("arm.xml", "<mujocoinclude><body/></mujocoinclude>", "give the file that includes it"),
     ],

@@ -57,7 +57,9 @@ def outline(path: str | Path) -> Outline:
     def start(name: str, attributes: Mapping[str, str]) -> None:
         found.root = found.root or name
         if found.root == "robot":
-            found.has_macros |= name.startswith("xacro:") or any("${" in x for x in attributes.values())
+            found.has_macros |= name.startswith("xacro:") or any(
+                "${" in x or ("$(" in x and key != "filename") for key, x in attributes.items()
+            )
         if name == "joint":
             joints[0] = attributes.get("name", "")
         elif name == "limit" and found.root == "robot" and (limit := _positive(attributes.get("velocity", ""))):
