@@ -253,7 +253,8 @@ def notes_on_simulated(label: str, compiled: Any, flaws: Sequence[tuple[Any, Fla
     """
     for body, flaw in flaws:
         if flaw.kind == "massless" and compiled.body_subtreemass[body.id] <= _NO_MASS * compiled.nbody:
-            raise ModelError(f'{label}: nothing that body "{body.name}" carries has a mass; give it one in the file')
+            name = body.name or f"body{body.id}"
+            raise ModelError(f'{label}: nothing that body "{name}" carries has a mass; give it one in the file')
     named = {body.name: flaw for body, flaw in flaws if flaw.kind == "impossible" and compiled.body_weldid[body.id]}
     return (_REPLACED.format(_listed(named)),) if named else ()
 
