@@ -32,7 +32,7 @@ KP, KD = (600.0, 600.0, 400.0, 400.0, 150.0, 100.0, 50.0), (40.0, 40.0, 25.0, 25
 
 @dataclass(frozen=True)
 class Link:
-    """A link behind a hinge about its z axis.
+    """A link behind a hinge about its z axis, or behind a slide along it.
 
     Parameters
     ----------
@@ -43,7 +43,9 @@ class Link:
     centre, moments : three floats
         Centre of mass, m; principal moments of inertia about it, kg m^2.
     armature, damping, friction : float
-        Of the hinge, SI.
+        Of the joint, SI.
+    kind : str, optional
+        "hinge" or "slide".
     """
 
     offset: tuple[float, float, float]
@@ -54,6 +56,7 @@ class Link:
     armature: float
     damping: float
     friction: float
+    kind: str = "hinge"
 
 
 R = np.pi / 2.0
@@ -102,6 +105,7 @@ def machine_like(links: tuple[Link, ...], seed: int) -> tuple[Link, ...]:
                 float(armature),
                 float(damping),
                 float(friction),
+                x.kind,
             )
         )
     return tuple(found)
@@ -119,7 +123,7 @@ def mjcf(links: tuple[Link, ...]) -> str:
         parts.append(f'<body name="link{k}" pos="{text(x.offset)}" euler="{text(x.turn)}">')
         parts.append(f'<inertial pos="{text(x.centre)}" mass="{x.mass!r}" diaginertia="{text(x.moments)}"/>')
         of_joint = f'armature="{x.armature!r}" damping="{x.damping!r}" frictionloss="{x.friction!r}"'
-        parts.append(f'<joint name="joint{k}" axis="0 0 1" {of_joint}/>')
+        parts.append(f'<joint name="joint{k}" type="{x.kind}" axis="0 0 1" {of_joint}/>')
     return "".join([*parts, "</body>" * len(links), "</worldbody></mujoco>"])
 
 

@@ -77,6 +77,7 @@ def test_json_has_every_limb(folder):
     [
         (["--model", "underwater-vehicle", "--unknown", "damping"], "--unknown is for the description of a robot"),
         (["--model", "dog.xml", "--control", "kd=3"], "--control: kp is missing"),
+        (["--model", "dog.xml", "--motor", "gear=3"], "or, if unknown, --motor constant=1 --unknown armature,damping,"),
         (["--model", "dog.xml", "--control", "kp=3,ki=4"], "--control: there is no 'ki'"),
         (["--model", "dog.xml", "--motor", "constant=much"], "--motor: could not convert"),
         (["--model", "dog.xml", "--motor", "constant=1", "--control", "kp=2"], "give one"),
@@ -86,6 +87,38 @@ def test_options_without_meaning_are_wrong_usage(folder, words, message):
     done = run("identify", "run.csv", *words)
     assert done.exit_code == 2
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("column", "words", "advice"),
+    [
+        ("target", [], "--control kp=NUMBER,kd=NUMBER (dr.PositionControl)"),
+        ("current", [], "--motor constant=NUMBER,gear=NUMBER (dr.MotorCurrents)"),
+        ("torque", ["--control", "kp=20"], "dr.JointTorques, the default: leave out --control and --motor"),
+        ("voltage", [], None),
+    ],
+)
+def test_the_drive_of_the_columns_of_a_log_is_named(folder, column, words, advice):
+    t = 0.01 * np.arange(300)
+    columns = {f"{leg}_{n}": np.sin(t + k) for leg in LEGS for k, n in enumerate(("hip", "thigh", "calf"))}
+    columns |= {f"{n}_{column}": x for n, x in columns.items()}
+    dr.Log.from_arrays(t, columns).write("other.csv")
+    command = ("other.csv", "--model", "dog.xml", "--joints", "{}_joint", *words)
+    refused, shown = run("identify", *command), run("inspect", *command)
+    assert refused.exit_code == 1
+    for text in (refused.stderr, shown.stdout):
+        assert (f'"FL_hip_{column}" is the column of another drive: {advice}' in text) == (advice is not None)
+        assert "is missing" in text or "missing: " in text
+
+
+def test_joints_without_a_drive_are_named(folder):
+    shown = json.loads(
+        run("models", "dog.xml", "--joints", "{}_joint", "--passive", "FL_calf, RR_calf", "--json").stdout
+    )
+    assert list(shown["inputs"]) == [f"{leg}_{n}_torque" for leg in LEGS for n in ("hip", "thigh")]
+    mask = ("--simulator", "mujoco", "--unknown", "joint/*.damping")
+    refused = run("models", "dog.xml", *mask, "--passive", "FL_calf_joint")
+    assert "--passive belongs to equations" in refused.stderr
 
 
 def test_a_description_is_never_overwritten(folder):

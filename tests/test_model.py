@@ -120,6 +120,12 @@ def test_mass_matrix_of_uneven_units_is_not_taken_for_singular():
     assert np.array(model.dynamics([0] * 4, [1], [1, 1])[1]).ravel() == pytest.approx([1e9, -1e-9])
 
 
+def test_a_mass_matrix_that_is_symmetric_but_for_rounding_is_solved():
+    rounding = 1e-17
+    model = two_axes(lambda q, v, a, u, p: [2.0 * a.x + rounding * ca.cos(q.x) * a.y - u.f, p.m * a.y + p.k])
+    assert np.array(model.dynamics([0] * 4, [1], [1, 1])[1]).ravel() == pytest.approx([0.5, -1.0])
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

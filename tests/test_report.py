@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
 import diransac as dr
+from diransac.arrays import bulk_range
 from diransac.data.dataset import Dataset
-from diransac.data.segment import bulk_range
 from diransac.identification.evaluation.prediction import predictions
 from diransac.identification.evaluation.scoring import judged_signals
 from diransac.report import figures, labelled, rendering

@@ -105,7 +105,7 @@ def test_a_joint_in_an_included_file_is_named(described, tmp_path):
     path = described('<mujoco><include file="legs.xml"/></mujoco>', "scene")
     model = models.robot(path)
     with pytest.raises(ModelError, match=r'joint "s" is not in this file by name; write the files that it includes'):
-        calibrated(path, model.parameters, nominal(model), np.eye(model.n_p))
+        calibrated(path, model.parameters, 2.0 * nominal(model), np.eye(model.n_p))
 
 
 def test_parameters_of_another_model_are_refused(described):

@@ -90,6 +90,17 @@ def test_the_nearest_possible_inertia_of_a_moving_body_is_taken_and_said(describ
 
 
 @EVERY_INERTIA
+def test_a_calibrated_file_has_the_nearest_possible_inertias_and_mujoco_compiles_it(described, inertia):
+    path = described(chain(link("first"), link("second", inertia)))
+    model = dr.models.robot(path)
+    values = np.array([1.5 * x.value for x in model.parameters.values()])
+    text, _ = calibrated(path, model.parameters, values, 1e-4 * np.eye(len(values)))
+    reference, data = compiled(described(text, "calibrated.urdf"))
+    for expected, motion in zip(forces(path), motions(2), strict=True):
+        assert inverse(reference, data, *motion) == pytest.approx(expected, abs=1e-9)
+
+
+@EVERY_INERTIA
 def test_inertias_of_bodies_that_do_not_move_have_no_effect(described, inertia):
     welded = LINK.format(
         "tray", "0 0 0", 1e-6, link("x", inertia)[link("x").index("<inertia ") : -len("</inertial></link>")]

@@ -157,6 +157,51 @@ def test_inertials_of_fixed_bodies_count_once(described):
     assert required(model, q[5:], v[5:], a[5:], p) == pytest.approx(inverse(reference, data, q, v, a)[5:])
 
 
+LINK = '<inertial pos="0 0 -.2" mass="1" diaginertia=".01 .02 .015"/>'
+HINGE = f'<mujoco>{{}}<worldbody><body {{}}><joint name="j" axis="0 1 0" {{}}/>{LINK}</body></worldbody>{{}}</mujoco>'
+
+
+@pytest.mark.parametrize(
+    ("options", "joint", "drive", "q", "v", "force"),
+    [
+        ("", 'stiffness="5 2 1"', "", -0.5, 0.0, -2.125),
+        ("", 'stiffness="5 2 1"', "", 0.5, 0.0, 3.125),
+        ("", 'damping="1 2 4"', "", 0.0, -0.5, -1.5),
+        ('<option><flag gravity="disable"/></option>', "", "", 0.7, 0.0, 0.0),
+        ('<option><flag gravity="disable" spring="disable"/></option>', 'stiffness="5"', "", 0.7, 0.0, 0.0),
+        ('<option><flag damper="disable"/></option>', 'damping="5"', "", 0.0, 0.7, 0.0),
+        ("", 'damping="1"', 'gear="-10" armature=".0005" damping=".001 .002"', 0.0, 2.0, 2.0 + 0.2 + 0.8),
+    ],
+)
+def test_attributes_act_as_in_mujoco(described, options, joint, drive, q, v, force):
+    text = HINGE.format(options, "", joint, f'<actuator><motor joint="j" {drive}/></actuator>')
+    model = dr.models.robot(described(text))
+    weight = 0.0 if "gravity" in options else 0.2 * 9.81 * np.sin(q)
+    assert required(model, [q], [v], [0.0], without_friction(model)) == pytest.approx([force + weight])
+    rotor = 0.05 if drive else 0.0
+    inertia = required(model, [0.0], [0.0], [1.0], without_friction(model))
+    assert inertia == pytest.approx([0.02 + 0.04 + rotor])
+    assert model.parameters["armature_j"].value == pytest.approx(rotor)
+
+
+def test_weight_that_drives_compensate_is_in_their_force(described):
+    text = HINGE.format("", "", 'actuatorgravcomp="true"', "").replace(
+        LINK, f'{LINK}<body pos="0 0 -.4" gravcomp="1"><joint name="k" axis="0 1 0"/>{LINK}</body>'
+    )
+    model = dr.models.robot(described(text))
+    q = [0.5, 0.3]
+    outer = 0.2 * 9.81 * np.sin(0.8)
+    both = 0.2 * 9.81 * np.sin(0.5) + 0.4 * 9.81 * np.sin(0.5) + outer
+    assert required(model, q, [0, 0], [0, 0], without_friction(model)) == pytest.approx([both, 0.0], abs=1e-12)
+
+
+def test_disabled_equality_constraints_couple_nothing(described):
+    free = dr.models.robot(
+        described(robots.panda_like().replace("<worldbody>", '<option><flag equality="disable"/></option><worldbody>'))
+    )
+    assert {"left_finger", "right_finger"} <= set(free.coordinates)
+
+
 # ---------------------------------------------------------------------- coupled, locked and free joints
 
 
@@ -255,9 +300,20 @@ CALF = '<joint name="FL_calf_joint"'
         (
             END,
             f'{END}<tendon><fixed stiffness="3"><joint joint="FL_calf_joint" coef="1"/></fixed></tendon>',
-            "tendons with stiffness",
+            r'stiffness of tendon "0" acts on its joints, by up to .* leave it out',
         ),
-        ("<worldbody>", '<option density="1.2"/><worldbody>', "surrounding fluid"),
+        ("<worldbody>", '<option density="1.2"/><worldbody>', "density acts on its joints"),
+        (CALF, f'{CALF} stiffness="5" springyield=".2"', r"springs that yield \(springyield\)"),
+        (
+            END,
+            f'{END}<tendon><fixed name="cord" damping="0 3"><joint joint="FL_calf_joint" coef="1"/></fixed></tendon>',
+            r'damping \(polynomial\) of tendon "cord" acts',
+        ),
+        (
+            END,
+            f'{END}<tendon><fixed frictionloss="3"><joint joint="FL_calf_joint" coef="1"/></fixed></tendon>',
+            "friction of a tendon is not modelled",
+        ),
         ("<worldbody>", "<worldbdy>", "cannot be read: XML"),
         ("<joint", "<site", "cannot be read: XML"),
     ],
@@ -271,7 +327,13 @@ def test_descriptions_without_equations_here_are_refused(described, old, new, me
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"unknown": ["inertia"]}, "unknown: there is no 'inertia'; choose from armature, damping"),
+        ({"unknown": ["inertial"]}, "unknown: there is no 'inertial'; choose from armature, damping"),
+        *(
+            ({"unknown": ["damping", name]}, rf'\'{name}\' belongs to bodies: .* \(--bodies\), "all" or some of link0')
+            for name in ("mass", "inertia", "com", "mass_hand", "Ixx_hand", "hx")
+        ),
+        ({"unknown": ["body/hand.mass"]}, r"'body/hand.mass' is a mask: .*\(--simulator mujoco\)"),
+        ({"unknown": ["kp"]}, "'kp' is a gain of a drive: where .* give 1, and the unknown \"torque_gain\""),
         ({"unknown": []}, "nothing is unknown"),
         ({"joints": ["elbow"]}, "joints: there is no 'elbow'; choose from joint1"),
         ({"joints": []}, "no joint is modelled"),
@@ -387,6 +449,8 @@ def test_an_encoder_bias_moves_the_mechanism_but_not_the_control(described):
         (lambda: dr.PositionControl(kp=1.0, target="target"), "target is 'target'; give a pattern"),
         (lambda: dr.MotorCurrents(constant={"a": 0.0}), "constant is 0; give a positive number"),
         (lambda: dr.JointTorques(limit="large"), "limit is 'large'; give a number"),
+        (lambda: dr.MotorCurrents(constant=None), "constant is None; where the constant is not known, give 1, and"),
+        (lambda: dr.PositionControl(kp=None), 'kp is None; where the kp is not known, give 1, and the unknown "torq'),
     ],
 )
 def test_drives_without_meaning_are_refused(make, message):

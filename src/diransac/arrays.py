@@ -25,6 +25,17 @@ def robust_std(deviations: FloatArray, axis: int | None = None) -> FloatArray:
     return np.asarray(MAD_TO_STD * np.median(np.abs(deviations), axis=axis))
 
 
+def bulk_range(values: FloatArray) -> tuple[float, float]:
+    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 0.0, 0.0
+    low, high = np.quantile(finite, [0.1, 0.9])
+    width = high - low
+    kept = finite[(finite >= low - width) & (finite <= high + width)]
+    return float(kept.min()), float(kept.max())
+
+
 def size_or_one(sizes: FloatArray) -> FloatArray:
     """Sizes by which arrays are divided: 1 in place of those that are not positive."""
     return np.where(sizes > 0.0, sizes, 1.0)

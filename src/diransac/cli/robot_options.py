@@ -70,6 +70,7 @@ class RobotOptions:
     joints: Annotated[
         str | None, _option(metavar="NAME,...|{}_joint", help="Joints, as column=joint if names differ; or a pattern.")
     ] = None
+    passive: Annotated[str | None, _option(metavar="NAME,...", help="Joints without a drive.")] = None
     base: Annotated[
         str | None, _option(metavar="held|measured", help="A floating base: held, or with a measured motion.")
     ] = None
@@ -131,7 +132,7 @@ class RobotOptions:
         """
         if self.simulator != "mujoco":
             raise typer.BadParameter(f"--simulator {self.simulator} is unknown; there is mujoco")
-        for name in ("bodies", "joints", "base", "inertia"):
+        for name in ("bodies", "joints", "passive", "base", "inertia"):
             if getattr(self, name) is not None:
                 raise typer.BadParameter(f"--{name} belongs to equations; with --simulator, name it in --unknown")
         if self.unknown is None:
@@ -142,6 +143,8 @@ class RobotOptions:
         found: dict[str, Any] = {"actuation": self._actuation(), "base": self.base}
         if self.unknown is not None:
             found["unknown"] = names(self.unknown)
+        if self.passive is not None:
+            found["passive"] = names(self.passive)
         if self.bodies is not None:
             found["bodies"] = "all" if self.bodies == "all" else names(self.bodies)
         if self.inertia is not None:
@@ -171,7 +174,8 @@ def _made(kind: type[Drives], option: str, text: str) -> Drives:
             raise typer.BadParameter(f"{option}: there is no {key!r}; there are {', '.join(known)}")
     needed = known[0]
     if needed not in given:
-        raise typer.BadParameter(f"{option}: {needed} is missing; give {needed}=number")
+        alone = f"{option} {needed}=1 --unknown armature,damping,friction,torque_gain"
+        raise typer.BadParameter(f"{option}: {needed} is missing; give {needed}=number, or, if unknown, {alone}")
     try:
         arguments: dict[str, Any] = {key: float(x) if key in _NUMBERS else x for key, x in given.items()}
         return kind(**arguments)

@@ -180,6 +180,19 @@ def bar(label: str) -> Iterator[Callback]:
     callable
         Takes a `Progress`.
     """
+    with _bar(label) as show:
+
+        def warned(found: Progress) -> None:
+            if found.warning and not (_STATE.for_programs or is_quiet()):
+                note(f"{label}: {found.warning}")
+            show(found)
+
+        yield warned
+
+
+@contextmanager
+def _bar(label: str) -> Iterator[Callback]:
+    """As `bar`, without warnings."""
     if _STATE.for_programs:
         threading.Thread(target=_heed_stop, daemon=True).start()
         yield lambda found: note(json_text({"label": label, **vars(found)}))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray, robust_std
+from diransac.arrays import BoolArray, FloatArray, IntArray, bulk_range, robust_std
 from diransac.data.log import Log
-from diransac.data.segment import Segment, bind_log, bulk_range
+from diransac.data.segment import Segment, bind_log
 from diransac.errors import LogError, SettingsError, check_known
 from diransac.model.parameter import parameter_of
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, long_runs, runs
+from diransac.arrays import BoolArray, FloatArray, bulk_range, long_runs, runs
 from diransac.data import preprocessing
 from diransac.data.checks import other_spelling, rows_per_sample
 from diransac.data.log import Log
@@ -250,17 +250,6 @@ def bind_log(model: Model, log: Log, also: Sequence[str] = (), *, pointwise: boo
     )
 
 
-def bulk_range(values: FloatArray) -> tuple[float, float]:
-    """Range of the values no further from the central 80 % than its width; (0, 0) without finite values."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 0.0, 0.0
-    low, high = np.quantile(finite, [0.1, 0.9])
-    width = high - low
-    kept = finite[(finite >= low - width) & (finite <= high + width)]
-    return float(kept.min()), float(kept.max())
-
-
 def _complete(known: BoolArray, is_sensor: BoolArray, pointwise: bool) -> BoolArray:
     """Rows ``(N,)`` that count, of samples ``(N, n)`` that are known.
 
@@ -312,7 +301,24 @@ def _raise_missing(model: Model, log: Log, name: str) -> None:
     absent = dict.fromkeys(n for n in (name, *model.inputs, *model.coordinates) if n not in log)
     pairs = [f"{n}={near}" for n in absent if (near := other_spelling(n, log.names, model)) is not None]
     found, also = ", ".join(("t", *log.names)), f"; by their names, --map {','.join(pairs)}" if pairs else ""
+    also += f"; {drive}" if (drive := other_drive(model, log)) else ""
     raise LogError(f'{log.source}: signal "{name}" is missing; found {found}. Give it, or {hint}{also}.')
+
+
+_DRIVES = {
+    "_target": "--control kp=NUMBER,kd=NUMBER (dr.PositionControl)",
+    "_current": "--motor constant=NUMBER,gear=NUMBER (dr.MotorCurrents)",
+    "_torque": "dr.JointTorques, the default: leave out --control and --motor",
+}
+"""Drive of a robot's joint by the ending of its column in the log."""
+
+
+def other_drive(model: Model, log: Log) -> str:
+    """Advice where a log lacks the columns of a robot's drives, and has those of another kind; empty elsewhere."""
+    missing = [n for n in model.inputs if n not in log]
+    joints = [q for q in model.coordinates for end in _DRIVES if f"{q}{end}" in missing]
+    found = [(f"{q}{end}", option) for q in joints for end, option in _DRIVES.items() if f"{q}{end}" in log]
+    return "" if not found else f'"{found[0][0]}" is the column of another drive: {found[0][1]}'
 
 
 def _check_spelling(model: Model, log: Log) -> None:

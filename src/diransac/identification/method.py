@@ -39,6 +39,8 @@ class Progress:
         Best parameters so far, in their units; empty where there are none yet.
     residuals : mapping of str to float, optional
         Standard deviation of the residuals of each signal with them, outliers apart, in its unit.
+    warning : str, optional
+        What will not work, with its remedy, to be shown at once; or empty.
     """
 
     stage: str
@@ -46,6 +48,7 @@ class Progress:
     note: str = ""
     parameters: Mapping[str, float] = field(default_factory=dict)
     residuals: Mapping[str, float] = field(default_factory=dict)
+    warning: str = ""
 
 
 Callback = Callable[[Progress], None]
@@ -185,9 +188,7 @@ def extremes(logs: Sequence[Log]) -> str:
     return f'"{name}" is {usual:.3g} in the median and {largest:.3g} at most; check its unit, and remove such outliers'
 
 
-def report(
-    callback: Callback | None, stage: str, fraction: float, note: str = "", **found: Mapping[str, float]
-) -> None:
+def report(callback: Callback | None, stage: str, fraction: float, note: str = "", **found: Any) -> None:
     """Call the callback, if there is one, with a `Progress`.
 
     Parameters

@@ -67,6 +67,11 @@ class Model(Signals):
         Parameters that come with a sensor follow the model's own; one that the model declares itself is the model's.
     description : str
         One line for lists of models.
+    ranges : mapping from coordinate to (float, float), optional
+        Smallest and largest value that the machine reaches. Columns beyond it in rad, and within it in degrees, are
+        read as degrees.
+    targets : mapping from input to coordinate, optional
+        Inputs that are targets of coordinates, or of their derivatives.
 
     Raises
     ------
@@ -93,11 +98,14 @@ class Model(Signals):
         first_order: Mapping[str, str] | None = None,
         sensors: Mapping[str, Sensor] | None = None,
         description: str = "",
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        targets: Mapping[str, str] | None = None,
     ) -> None:
         parameters = with_parameters_of(f'model "{name}"', sensors, parameters)
         units = {n: x.unit for n, x in (sensors or {}).items()}
         groups = (coordinates, inputs, parameters, velocities, first_order or {})
         self._name_signals(name, *groups, description, units)
+        self._name_ranges(ranges or {}, targets or {})
         if (velocities is None) != (kinematics is None):
             given, missing = ("velocities", "kinematics") if kinematics is None else ("kinematics", "velocities")
             raise ModelError(f'model "{name}": {given} without {missing}; give both, or neither')
@@ -405,6 +413,8 @@ class Model(Signals):
             first_order=self.first_order,
             sensors=sensors,
             description=self.description,
+            ranges=self.ranges,
+            targets=self.targets,
         )
         model.held_by, model.notes = self.held_by, self.notes
         return model
@@ -419,6 +429,7 @@ class Model(Signals):
         Raises ModelError: there would be too many operations.
         """
         M = ca.sparsify((self.force_sign or 1) * self._mass_matrix(q, v, u, p))
+        M = ca.triu2symm(ca.triu(M)) if self.force_sign else M  # rounding may leave an entry in one triangle alone
         derivation.check_solution(self._label, M.sparsity(), rhs.size2(), symmetric=self.force_sign != 0)
         if self.force_sign == 0:
             return ca.solve(ca.densify(M), ca.densify(rhs))
@@ -481,6 +492,8 @@ class Model(Signals):
         }
         if self.measurement is not None:
             data |= {"sensors": self.sensors, "measurement": self._equations_data["measurement"]}
+        if self.ranges or self.targets:
+            data |= {"ranges": {n: list(x) for n, x in self.ranges.items()}, "targets": self.targets}
         return data
 
     @classmethod
@@ -505,6 +518,7 @@ class Model(Signals):
         parameters = {n: Parameter.from_dict(x) for n, x in data["parameters"].items()}
         units = (data["coordinates"], data["inputs"], parameters, data["velocities"], data.get("first_order", {}))
         model._name_signals(data["name"], *units, data["description"], data.get("sensors", {}))
+        model._name_ranges(data.get("ranges", {}), data.get("targets", {}))
         has_kinematics, has_sensors = data["kinematics"] is not None, data.get("measurement") is not None
         if has_kinematics != (data["velocities"] is not None) or has_sensors != bool(model.sensors):
             raise ResultError("the stored model is damaged: its names do not fit its equations; identify again")

@@ -99,15 +99,18 @@ def _part(model: Model, name: str, group: Sequence[int]) -> Model:
     def equations(*vectors: Symbols) -> Sequence[Any]:
         return [model.residual(*arguments(*vectors))[np.flatnonzero(rows).tolist()]]
 
+    own_inputs = _selected(model.inputs, inputs)
     part = Model(
         f"{model.name} {name}",
         {n: unit for n, unit in model.coordinates.items() if n in states},
-        _selected(model.inputs, inputs),
+        own_inputs,
         _selected(model.parameters, parameters),
         equations,
         first_order={n: unit for n, unit in model.first_order.items() if n in states},
         sensors=_selected(model.sensors_of(arguments), shown),
         description=model.description,
+        ranges={n: x for n, x in model.ranges.items() if n in states},
+        targets={n: x for n, x in model.targets.items() if n in own_inputs and x in states},
     )
     part.notes = model.notes
     return part

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -52,6 +52,25 @@ class Signals:
         groups = (coordinates, of_motion, first_order, accelerations, rates, inputs, parameters, sensors)
         derivation.check_names(self._label, groups, masks=not self.has_equations)
         self.velocities, self.accelerations = {**of_motion, **self.first_order}, {**accelerations, **rates}
+
+    def _name_ranges(self, ranges: Mapping[str, Sequence[float]], targets: Mapping[str, str]) -> None:
+        """Take the ranges of coordinates, and the coordinates that inputs are targets of.
+
+        Raises ModelError: a name is unknown, or a range is none.
+        """
+        for what, own, known in (
+            ("ranges", ranges, self.coordinates),
+            ("targets", targets, self.inputs),
+            ("targets", targets.values(), self.coordinates),
+        ):
+            for name in own:
+                if name not in known:
+                    raise ModelError(f"{self._label}: {what}: there is no {name!r}; found {', '.join(known)}")
+        for name, (low, high) in ranges.items():
+            if not low < high:
+                raise ModelError(f"{self._label}: the range of {name} is {low:g} to {high:g}; give low < high")
+        self.ranges = {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
+        self.targets = dict(targets)
 
     @property
     def _label(self) -> str:

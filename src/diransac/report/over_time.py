@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diransac import arrays
-from diransac.arrays import BoolArray, FloatArray, IntArray
-from diransac.data import segment
+from diransac.arrays import BoolArray, FloatArray, IntArray, bulk_range
 from diransac.data.log import Log
 from diransac.identification.diagnosis import Diagnosis
 from diransac.model import Model
@@ -240,7 +239,7 @@ def _residuals(name: str, having: Sequence[tuple[int, Run]], shown: Run, timelin
         if run is shown:
             traces.append(_dots(f"{run.label} (outlier)", look, run, errors, apart))
         traces.append(_dots(run.label, f"m{i}", run, errors, ~apart))
-        ranges.append(segment.bulk_range(errors[~apart] if np.mean(apart) < 0.5 else errors))
+        ranges.append(bulk_range(errors[~apart] if np.mean(apart) < 0.5 else errors))
     level, meaning = _level(name, shown)
     levels = (-level, level) if level > 0.0 else ()
     low, high = shown.ranges[name]

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from diransac.arrays import BoolArray, FloatArray, IntArray
+from diransac.arrays import BoolArray, FloatArray, IntArray, bulk_range
 from diransac.data import preprocessing
 from diransac.data.dataset import Dataset
 from diransac.data.log import Log
-from diransac.data.segment import Segment, bulk_range
+from diransac.data.segment import Segment
 from diransac.errors import LogError, ResultError, SettingsError
 from diransac.identification.assessment.validation import Validation, validated
 from diransac.identification.diagnosis import Departure, Diagnosis, departures

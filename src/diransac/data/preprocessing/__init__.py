@@ -8,13 +8,16 @@ Each step adds one mapping to ``Log.history`` and, where it changes samples, a s
 | `differentiation.py` | velocities and accelerations, and rows filtered against their noise |
 | `spikes.py` | `despike`, by running medians |
 | `continuity.py` | angles without wraps, quaternions without changes of sign |
+| `degrees.py` | columns of joints in degrees that do not say so |
 | `wraps.py` | periods of counters that wrap |
 """
 
 from diransac.data.preprocessing.continuity import continuous, continuous_quaternions, unwrap
+from diransac.data.preprocessing.degrees import in_degrees
 from diransac.data.preprocessing.differentiation import acting_inputs, differentiate, filter_rows
 from diransac.data.preprocessing.spikes import despike, hampel
 from diransac.data.preprocessing.steps import (
+    in_stated_units,
     in_units,
     keep_while,
     leave_out,
@@ -35,6 +38,8 @@ __all__ = [
     "differentiate",
     "filter_rows",
     "hampel",
+    "in_degrees",
+    "in_stated_units",
     "in_units",
     "keep_while",
     "leave_out",

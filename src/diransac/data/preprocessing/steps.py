@@ -13,6 +13,7 @@ from diransac.arrays import FloatArray, runs
 from diransac.data.checks import ROUNDING, is_implausible
 from diransac.data.clock import Aligned
 from diransac.data.preprocessing.continuity import interpolated, unwrap
+from diransac.data.preprocessing.degrees import in_degrees
 from diransac.data.preprocessing.spikes import despike
 from diransac.data.units import conversion, same_unit
 from diransac.errors import LogError, SettingsError
@@ -125,6 +126,23 @@ def unit_factors(units: Mapping[str, str], model: Model, source: str) -> dict[st
 
 
 def in_units(log: Log, model: Model) -> Log:
+    """Log with the signals and inputs of a model in the model's units; the same log if they are.
+
+    Parameters
+    ----------
+    log : Log
+        A whole recording. A signal without a known unit is in the model's, or in degrees: see `in_degrees`.
+    model : Model
+
+    Raises
+    ------
+    LogError
+        As `in_stated_units`.
+    """
+    return in_stated_units(in_degrees(log, model), model)
+
+
+def in_stated_units(log: Log, model: Model) -> Log:
     """Log with the signals and inputs of a model in the model's units; the same log if they are.
 
     Parameters

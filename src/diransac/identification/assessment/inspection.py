@@ -14,13 +14,13 @@ from diransac.data import preprocessing
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, as_logs, usable_sensors
 from diransac.data.log import Log
-from diransac.data.segment import spelling_notes
+from diransac.data.segment import other_drive, spelling_notes
 from diransac.errors import IdentificationError, LogError, SettingsError
 from diransac.identification.evaluation.scoring import choose_scoring
 from diransac.identification.regression.estimators import OrdinaryLeastSquares
 from diransac.identification.regression.uncertainty import jackknife_covariance
 from diransac.identification.settings import Settings
-from diransac.identification.structure.columns import contradictions
+from diransac.identification.structure.columns import contradictions, reversed_signs
 from diransac.identification.structure.identifiability import equations_in_words, in_words, of_log
 from diransac.identification.structure.known_parameters import KnownParameters
 from diransac.identification.structure.refusal import check_motion
@@ -229,6 +229,7 @@ def inspect(
 
 def _contents(log: Log, model: Model | None) -> Inspection:
     """Statistics of one log."""
+    log = log if model is None else preprocessing.in_degrees(log, model)
     continuous = preprocessing.unwrap(log) if model is None else preprocessing.continuous(log, model)
     events = {name: float(np.mean(log[name] == 1.0)) for name in _events(log)}
     signals = {name: _signal_facts(log, name, continuous[name]) for name in log.names if name not in events}
@@ -289,7 +290,7 @@ def _fitness(logs: Sequence[Log], model: Model, contents: Sequence[Inspection]) 
     excitation, reason, caveats = dict[str, Excitation](), "", list[str]()
     if derivable != missing:
         later = "lo-diransac estimates them; excitation is known only after identification"
-        reason = "" if set(missing) & set(model.inputs) else later
+        reason = other_drive(model, logs[0]) if set(missing) & set(model.inputs) else later
     elif model.nonlinear_parameters:
         names = ", ".join(model.nonlinear_parameters)
         reason = f"not affine in {names}: excitation is known only after identification"
@@ -299,7 +300,7 @@ def _fitness(logs: Sequence[Log], model: Model, contents: Sequence[Inspection]) 
         except (LogError, IdentificationError) as error:
             reason = str(error)
     if excitation and not reason:
-        caveats = [f"{x.claim}; {x.action}" for x in contradictions(model, logs)]
+        caveats = [f"{x.claim}; {x.action}" for x in contradictions(model, logs) or reversed_signs(model, logs)]
         spiked = [n for n in model.required_signals if any(n in x.signals and x.signals[n].n_spikes for x in contents)]
         if spiked:
             bias = f"spikes in {', '.join(spiked)} bias these estimates and errors"

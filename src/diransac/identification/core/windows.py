@@ -547,6 +547,9 @@ class AugmentedModel:
         return (*self.model.state, *names[last:], *names[:last])
 
 
+_MOST_GAINS = 24
+
+
 @lru_cache(maxsize=16)
 def augmented_model(model: Model, *, discrepancies: bool = True, noisy: bool = False) -> AugmentedModel:
     """The model with unmodelled accelerations, and input gain and bias discrepancies.
@@ -565,7 +568,8 @@ def augmented_model(model: Model, *, discrepancies: bool = True, noisy: bool = F
     """
     derived, own = model.kinematics is None, model.rate_names
     latent = [f"error_{n}" for n in model.inputs] if noisy else [f"unmodelled_{n}" for n in own]
-    gains = [f"discrepancy_{i}_{k}" for i in range(model.n_v) for k in range(model.n_u + 1)] if discrepancies else []
+    pairs = discrepant_pairs(model) if discrepancies else ()
+    gains = [f"discrepancy_{i}_{k}" for i, k in pairs]
 
     def arguments(q: Symbols, v: Symbols, a: Symbols, u: Symbols, p: Symbols) -> list[ca.SX]:
         motion = [_stacked(q, model.coordinates), _stacked(v, own), _stacked(a, own)]
@@ -577,7 +581,10 @@ def augmented_model(model: Model, *, discrepancies: bool = True, noisy: bool = F
         modelled = accelerations - (0.0 if noisy else _stacked(p, latent))
         residuals = model.residual(coordinates, velocities, modelled, applied, parameters)
         if discrepancies:
-            residuals -= ca.reshape(_stacked(p, gains), model.n_u + 1, model.n_v).T @ ca.vertcat(1, applied)
+            sizes = ca.SX(model.n_v, model.n_u + 1)
+            for n, x in zip(gains, pairs, strict=True):
+                sizes[x] = getattr(p, n)
+            residuals -= sizes @ ca.vertcat(1, applied)
         return list(ca.vertsplit(residuals))
 
     def kinematics(q: Symbols, v: Symbols) -> list[object]:
@@ -596,6 +603,22 @@ def augmented_model(model: Model, *, discrepancies: bool = True, noisy: bool = F
         sensors=model.sensors_of(arguments),
     )
     return AugmentedModel(augmented, model.n_p, len(latent), len(gains))
+
+
+@lru_cache(maxsize=16)
+def discrepant_pairs(model: Model) -> tuple[tuple[int, int], ...]:
+    """Equation and column of each discrepancy: its bias (column 0), and a gain of each input k (column k + 1).
+
+    Of more than 30 gains, those of inputs that act in the equation alone: their number grows with the square of the
+    number of joints, and so do the memory and the time of a fit.
+
+    Parameters
+    ----------
+    model : Model
+    """
+    acts = np.array(ca.DM(model.residual.sparsity_jac(3, 0), 1)) != 0.0
+    every = model.n_v * model.n_u <= _MOST_GAINS
+    return tuple((i, k) for i in range(model.n_v) for k in range(model.n_u + 1) if k == 0 or every or acts[i, k - 1])
 
 
 def _stacked(symbols: Symbols, names: Iterable[str]) -> ca.SX:

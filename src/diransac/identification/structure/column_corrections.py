@@ -23,7 +23,7 @@ import numpy as np
 
 from diransac.arrays import BoolArray, FloatArray, IntArray
 from diransac.data.units import conversion, one_turn
-from diransac.identification.core.rows import Rows, inclusive_bounds
+from diransac.identification.core.rows import Rows, Solution, inclusive_bounds
 from diransac.identification.regression.rows import (
     EXACT,
     MotionRows,
@@ -165,11 +165,7 @@ class CorrectionTests:
     def of(self, correction: Correction, model: Model | None = None) -> CorrectedEquations:
         """The equations with a correction, or those of another model of the same signals."""
         model = model or self.model
-        # 600 rows of each log are enough.
-        some = [np.arange(0, len(x.q), max(1, len(x.q) // 600)) for x in self.rows]
-        parts = [correction.of_rows(model, *pair) for pair in zip(self.rows, some, strict=True)]
-        # Blocks of rows that alternate: neighbours in time have correlated errors.
-        held = [np.arange(len(x)) * 20 // max(1, len(x)) % 2 == 1 for x in some]
+        parts, held = self._parts(correction, model)
         predict = self._nonlinear if model.nonlinear_parameters else self._affine
         found = predict(model, parts, held)
         if found is None:
@@ -178,27 +174,34 @@ class CorrectionTests:
         outside = outside_bounds(self.layout, parameters, errors)
         return CorrectedEquations(correction, parameters, np.maximum(residuals, EXACT), outside)
 
+    def one_by_one(self, correction: Correction) -> FloatArray:
+        """Residuals ``(n_eq,)`` with a correction of equations that are affine, each with parameters of its own."""
+        parts, held = self._parts(correction, self.model)
+        rows, finite = scaled_equations(self.model, self.layout, parts)
+        residuals = np.full(rows.b.shape[1], np.inf)
+        for i in range(len(residuals)):
+            own = np.flatnonzero(rows.W[:, i].any(axis=0))
+            bounds = tuple(x[own] for x in inclusive_bounds(self.layout.bounds, zero=True))
+            one = Rows(rows.W[:, i : i + 1, own], rows.b[:, i : i + 1])
+            found = _predicted(one, np.concatenate(held)[finite], (bounds[0], bounds[1]))
+            residuals[i] = np.inf if found is None else found[1][0]
+        return residuals
+
+    def _parts(self, correction: Correction, model: Model) -> tuple[list[MotionRows], list[BoolArray]]:
+        """Some rows of each log with a correction, and a mask of those that are predicted."""
+        # 600 rows of each log are enough.
+        some = [np.arange(0, len(x.q), max(1, len(x.q) // 600)) for x in self.rows]
+        parts = [correction.of_rows(model, *pair) for pair in zip(self.rows, some, strict=True)]
+        # Blocks of rows that alternate: neighbours in time have correlated errors.
+        return parts, [np.arange(len(x)) * 20 // max(1, len(x)) % 2 == 1 for x in some]
+
     def _affine(
         self, model: Model, parts: Sequence[MotionRows], held: Sequence[BoolArray]
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Parameters, standard errors and residuals of ``W p = b``; None without a known term."""
         rows, finite = scaled_equations(model, self.layout, parts)
-        predicted = np.concatenate(held)[finite]
-        if not predicted.any() or predicted.all() or not rows.b.any():
-            return None
-        fitted = Rows(rows.W[~predicted], rows.b[~predicted])
-        bounds, found = inclusive_bounds(self.layout.bounds, zero=True), robust_fit(fitted)
-        if found is None:
-            return None
-        is_possible = (np.clip(found.p, *bounds) == found.p).all()
-        possible = found if is_possible else (robust_fit(fitted, bounds) or found)
-        W, b = rows.W[predicted], rows.b[predicted]
-        residuals = np.median(np.abs(W @ possible.p - b), axis=0)
-        # Zero solves an equation without a known term: its residual is that over its terms.
-        whole = np.median(np.abs(W) @ np.abs(possible.p), axis=0)
-        of_terms = np.where(whole > EXACT, residuals / np.maximum(whole, EXACT), 1.0)
-        residuals = np.where(b.any(axis=0), residuals, of_terms)
-        return found.p, found.errors(), residuals
+        found = _predicted(rows, np.concatenate(held)[finite], inclusive_bounds(self.layout.bounds, zero=True))
+        return None if found is None else (found[0].p, found[0].errors(), found[1])
 
     def _nonlinear(
         self, model: Model, parts: Sequence[MotionRows], held: Sequence[BoolArray]
@@ -223,6 +226,26 @@ class CorrectionTests:
         return solution.parameters, solution.errors, np.where(np.isfinite(residuals), residuals, np.inf)
 
 
+def _predicted(
+    rows: Rows, predicted: BoolArray, bounds: tuple[FloatArray, FloatArray]
+) -> tuple[Solution, FloatArray] | None:
+    """Solution of some rows, and residuals of the others with it, within its bounds; None without a known term."""
+    if not predicted.any() or predicted.all() or not rows.b.any():
+        return None
+    fitted = Rows(rows.W[~predicted], rows.b[~predicted])
+    found = robust_fit(fitted)
+    if found is None:
+        return None
+    is_possible = (np.clip(found.p, *bounds) == found.p).all()
+    possible = found if is_possible else (robust_fit(fitted, bounds) or found)
+    W, b = rows.W[predicted], rows.b[predicted]
+    residuals = np.median(np.abs(W @ possible.p - b), axis=0)
+    # Zero solves an equation without a known term: its residual is that over its terms.
+    whole = np.median(np.abs(W) @ np.abs(possible.p), axis=0)
+    of_terms = np.where(whole > EXACT, residuals / np.maximum(whole, EXACT), 1.0)
+    return found, np.where(b.any(axis=0), residuals, of_terms)
+
+
 # ---------------------------------------------------------------------- acceptance
 
 
@@ -239,10 +262,42 @@ def explained(tests: CorrectionTests) -> tuple[list[CorrectedEquations], int]:
         Number of corrections that were tested.
     """
     tested = [tests.of(x) for x in corrections(tests.model)]
-    accepted = _accepted(tests, [*tested, *_several_signs(tests)])
+    accepted = _accepted(tests, [*tested, *_several_signs(tests, tests.without)])
     if not accepted and tests.delays:
         accepted = _accepted(tests, list(_delays(tests)))
     return accepted, len(tested)
+
+
+def reversed_drives(tests: CorrectionTests) -> list[CorrectedEquations]:
+    """The sign of the inputs that drive one equation each, where it is reversed, and of coordinates as an alternative.
+
+    Each of these equations, whatever the others are, is explained with the other sign alone: parameters within their
+    bounds fit it much worse as it was recorded, since armature, damping and friction would be negative, and gravity
+    points upwards.
+    """
+    model, drives = tests.model, drives_of(tests.model)
+    recorded = tests.one_by_one(Correction())
+    other = tests.one_by_one(Correction(tuple(drives.values()), factor=-1.0))
+    found = [i for i in drives if other[i] < min(MUCH_BETTER * recorded[i], EXPLAINED)]
+    if not found:
+        return []
+    forces = tests.of(Correction(tuple(drives[i] for i in found), factor=-1.0))
+    # Shared parameters show a sign that many parameters of one equation hide.
+    for more in _several_signs(tests, forces):
+        forces = more if forces.improved_by(more).any() else forces
+    if model.n_q < model.n_v:
+        return [forces]
+    motion = tests.of(Correction(tuple(list(model.coordinates)[i] for i in found), factor=-1.0))
+    return [forces, motion] if motion.residual < DISTINCT * forces.residual else [forces]
+
+
+def drives_of(model: Model) -> dict[int, str]:
+    """Input of each equation that has one, and shares it with no other; a target is no force."""
+    equations, inputs = (np.array(x) for x in model.residual.jac_sparsity(0, 3).get_triplet())
+    names = list(model.inputs)
+    pairs = zip(equations.tolist(), inputs.tolist(), strict=True)
+    own = {i: names[k] for i, k in pairs if np.sum(equations == i) == np.sum(inputs == k) == 1}
+    return {i: name for i, name in own.items() if name not in model.targets}
 
 
 def _accepted(tests: CorrectionTests, tested: Sequence[CorrectedEquations]) -> list[CorrectedEquations]:
@@ -316,9 +371,8 @@ def corrections(model: Model) -> Iterator[Correction]:
         yield Correction(kelvin, "degC", offset=273.15)
 
 
-def _several_signs(tests: CorrectionTests) -> Iterator[CorrectedEquations]:
+def _several_signs(tests: CorrectionTests, best: CorrectedEquations) -> Iterator[CorrectedEquations]:
     """Signs of more and more inputs, each that with which fewer parameters are outside of their bounds."""
-    best = tests.without
     while best.outside:
         names = best.correction.names
         more = [tests.of(Correction((*names, n), factor=-1.0)) for n in tests.model.inputs if n not in names]

@@ -30,8 +30,10 @@ from diransac.identification.structure.column_corrections import (
     CorrectedEquations,
     CorrectionTests,
     corrections,
+    drives_of,
     explained,
     other_units,
+    reversed_drives,
 )
 from diransac.text_table import listed, number
 
@@ -95,11 +97,7 @@ def mistakes_of_columns(dataset: Dataset, *, delays: bool = True) -> tuple[list[
     if certain:
         return certain, 0
     try:
-        model = dataset.model.with_sensors(())
-        parts = [_middle(log) for log in dataset.given]
-        complete = all(set(model.required_signals) <= set(log.signals) for log in parts)
-        derived = Dataset.of(model, parts if complete else [differentiate(x, model) for x in parts], pointwise=True)
-        return explanations(CorrectionTests(model, derived.layout, motion_rows(derived), delays), dataset.given)
+        return explanations(_tests(dataset.model, dataset.given, delays), dataset.given)
     except TimeLimitError:
         raise
     except (DiransacError, np.linalg.LinAlgError):
@@ -107,6 +105,40 @@ def mistakes_of_columns(dataset: Dataset, *, delays: bool = True) -> tuple[list[
         if not rows:
             return [], 0  # the equations cannot be evaluated on the logs
         return explanations(CorrectionTests(dataset.model, dataset.layout, rows, delays), dataset.given)
+
+
+def reversed_signs(model: Model, logs: Sequence[Log]) -> list[Mistake]:
+    """The reversed signs of columns that drive one equation each: see `reversed_drives`.
+
+    Parameters
+    ----------
+    model : Model
+        Without equations that are affine in its parameters, it has none.
+    logs : sequence of Log
+        Derivatives may be missing.
+    """
+    if not model.has_equations or model.nonlinear_parameters or not drives_of(model):
+        return []
+    try:
+        with np.errstate(all="ignore"):  # equations that overflow prove nothing
+            tests = _tests(model, logs, delays=False)
+            accepted = reversed_drives(tests)
+            return [_of_correction(tests, logs, accepted)] if accepted else []
+    except TimeLimitError:
+        raise
+    except (DiransacError, np.linalg.LinAlgError):  # the equations cannot be evaluated on the logs
+        return []
+
+
+def _tests(model: Model, logs: Sequence[Log], delays: bool) -> CorrectionTests:
+    """Tests of corrections by rows of logs, with the derivatives that these may lack.
+
+    Raises DiransacError: the equations cannot be evaluated on the logs.
+    """
+    parts, model = [_middle(in_units(log, model)) for log in logs], model.with_sensors(())
+    complete = all(set(model.required_signals) <= set(log.signals) for log in parts)
+    derived = Dataset.of(model, parts if complete else [differentiate(x, model) for x in parts], pointwise=True)
+    return CorrectionTests(model, derived.layout, motion_rows(derived), delays)
 
 
 def explanations(tests: CorrectionTests, logs: Sequence[Log]) -> tuple[list[Mistake], int]:
@@ -144,10 +176,11 @@ def _of_correction(tests: CorrectionTests, logs: Sequence[Log], accepted: Sequen
         return Mistake(what, f"with {them} plus {one.offset:g}, {why}", f"add {one.offset:g} to {listed(columns)}")
     if len(accepted) > 1:
         what = f"The sign of {' or '.join(listed(x.correction.names) for x in accepted)} is reversed"
-    if without.outside:
+    mended = [n for n in without.outside if n not in accepted[0].outside]
+    if mended:
         values = dict(zip(tests.layout.names, without.parameters, strict=True))
-        impossible = ", ".join(f"{n} = {values[n]:.4g}" for n in without.outside)
-        are = "is" if len(without.outside) == 1 else "are"
+        impossible = ", ".join(f"{n} = {values[n]:.4g}" for n in mended)
+        are = "is" if len(mended) == 1 else "are"
         why += f", and {impossible}, outside the bounds as recorded, {are} within"
     return Mistake(what, f"with {them} multiplied by {one.factor:.4g}, {why}", _scaled(columns, one.factor))
 
@@ -189,7 +222,7 @@ def contradictions(model: Model, logs: Sequence[Log]) -> list[Mistake]:
     wrapped = wraps(model, logs)
     if wrapped:
         return wrapped
-    prepared = [continuous(in_units(_middle(log).measured, model), model) for log in logs]
+    prepared = [continuous(_middle(in_units(log.measured, model)), model) for log in logs]
     ratios = list(_ratios(model, prepared))
     clocks = {unit: conversion(unit, "s") or 1.0 for unit in ("ms", "us")}
     slow = [u for u, x in clocks.items() if ratios and all(_is_near(r.ratio, x**r.order) for r in ratios)]

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diransac.arrays import FloatArray, robust_std
+from diransac.arrays import FloatArray, bulk_range, robust_std
 from diransac.data.checks import rows_per_sample
 from diransac.data.dataset import Dataset, ParameterLayout
-from diransac.data.segment import bulk_range
 from diransac.errors import IdentificationError
 from diransac.identification.regression.rows import (
     MotionRows,
@@ -26,13 +25,11 @@ from diransac.identification.regression.rows import (
 )
 from diransac.identification.regression.uncertainty import CLEAR
 from diransac.identification.structure.column_corrections import CorrectionTests
-from diransac.identification.structure.columns import explanations
+from diransac.identification.structure.columns import explanations, reversed_signs
 from diransac.identification.structure.identifiability import Ambiguity, equations_in_words, in_words, of_log
+from diransac.identification.structure.prospects import ADVICE, Prospects
 from diransac.identification.structure.structural import Ranges, structural
 from diransac.model import Model
-
-_ADVICE = "compare the terms, constants and bounds of the model with the machine"
-
 
 # ---------------------------------------------------------------------- a log without motion
 
@@ -117,12 +114,12 @@ def cause_of_refusal(model: Model, layout: ParameterLayout, logs: Sequence[Motio
     names = ", ".join(layout.names)
     if model.nonlinear_parameters:
         why = "no simulation within the bounds follows the log"
-        return f"{names} cannot be estimated, since {why}; give narrower bounds, or {_ADVICE}"
+        return f"{names} cannot be estimated, since {why}; give narrower bounds, or {ADVICE}"
     if found is None:
-        return f"{names} cannot be estimated: in each row of the log the equations overflow; {_ADVICE}"
+        return f"{names} cannot be estimated: in each row of the log the equations overflow; {ADVICE}"
     if not found.has_known_terms:
         return _no_known_terms(model, layout, logs)
-    return _cause_of_solution(layout, len(logs), found, of_model)
+    return _cause_of_solution(Prospects(model, layout, logs), found, of_model)
 
 
 def _ranges(model: Model, logs: Sequence[MotionRows]) -> Ranges:
@@ -131,11 +128,12 @@ def _ranges(model: Model, logs: Sequence[MotionRows]) -> Ranges:
     return tuple((n, *bulk_range(x)) for n, x in zip((*model.state, *model.inputs), columns, strict=True))
 
 
-def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: RowsSolution, of_model: Sequence[Ambiguity]) -> str:
+def _cause_of_solution(prospects: Prospects, found: RowsSolution, of_model: Sequence[Ambiguity]) -> str:
     """The cause where least squares of all rows has a solution: ambiguities, bounds, or noise."""
+    layout = prospects.layout
     if of_model:
         return equations_in_words(of_model)
-    of_rows = in_words(of_log(layout.names, found.space), n_logs)
+    of_rows = in_words(of_log(layout.names, found.space), len(prospects.rows))
     if of_rows:
         return of_rows
     values = dict(zip(layout.names, zip(found.parameters, found.errors, strict=True), strict=True))
@@ -143,10 +141,11 @@ def _cause_of_solution(layout: ParameterLayout, n_logs: int, found: RowsSolution
     named = ", ".join(f"{n} = {values[n][0]:.4g} ± {values[n][1]:.2g}" for n in clearly or outside or values)
     fitted = f"least squares of all rows gives {named}"
     if clearly:
-        return f"{fitted}, clearly outside {'its' if len(clearly) == 1 else 'their'} bounds; {_ADVICE}"
+        bounds = "its bounds" if len(clearly) == 1 else "their bounds"
+        return f"{fitted}, clearly outside {bounds}; {prospects.remedy(clearly)}"
     if outside:
         return f"{fitted}, an error that reaches across the bounds: noise hides the motion; record more, or smooth more"
-    return f"{fitted}, within the bounds, but simulations with it do not follow the log; {_ADVICE}"
+    return f"{fitted}, within the bounds, but simulations with it do not follow the log; {ADVICE}"
 
 
 def check_known_terms(dataset: Dataset) -> None:
@@ -171,6 +170,18 @@ def _no_known_terms(model: Model, layout: ParameterLayout, logs: Sequence[Motion
     cause = f"{', '.join(zero)} {verb} zero throughout" if zero else "each known term is zero throughout"
     advice = f"record known forces, or fix one, {every.remedy()}"
     return every.sentence(f"b = 0 in each row of W p = b, since {cause}: {every.determined()}; {advice}")
+
+
+def check_drives(dataset: Dataset) -> None:
+    """Raise IdentificationError if the forces of drives are reversed, before anything is searched.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    """
+    mistakes = reversed_signs(dataset.model, dataset.given)
+    if mistakes:
+        raise IdentificationError(f"{dataset.source}: {mistakes[0].claim}; {mistakes[0].action}")
 
 
 def check_signs(dataset: Dataset, rows: Sequence[MotionRows]) -> None:

@@ -143,7 +143,7 @@ class Tracker:
     def _columns(self, samples: Samples) -> tuple[FloatArray, FloatArray]:
         """Stamps ``(n,)`` and rows ``(n, n_columns)`` of samples, NaN where nothing is measured."""
         if isinstance(samples, Log):
-            log = preprocessing.in_units(samples.measured, self._setup.model)
+            log = preprocessing.in_stated_units(samples.measured, self._setup.model)
             columns: dict[str, npt.ArrayLike] = {"t": log.time, **log.signals}
         elif isinstance(samples, Mapping):
             columns = dict(samples)
@@ -291,7 +291,7 @@ def track(model: Model, log: Log, **options: Any) -> Iterator[TrackedEstimate]:
     if not isinstance(log, Log):
         raise SettingsError(f"log is a {type(log).__name__}; give a dr.Log, such as dr.read_log(path)")
     tracker = Tracker(model, background=False, **options)
-    return refused_if_none(tracker, tracker._estimates(*tracker._columns(log)))
+    return refused_if_none(tracker, tracker._estimates(*tracker._columns(preprocessing.in_units(log, model))))
 
 
 def refused_if_none(tracker: Tracker, estimates: Iterator[TrackedEstimate]) -> Iterator[TrackedEstimate]:

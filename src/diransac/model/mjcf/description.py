@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +10,11 @@ import numpy as np
 
 from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
-from diransac.model.robots.description import mujoco_module, parsed, without_warnings
+from diransac.model.robots.description import further_states, mujoco_module, parsed, without_warnings
+from diransac.model.robots.document import Document
 from diransac.model.robots.inertias import THIN_IN_TEXT, notes_on_simulated
 from diransac.model.robots.mechanism import identifier
+from diransac.model.robots.written import with_inertials
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,7 +77,7 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
         The file cannot be read, or has what is not simulated here: plugins, soft bodies, delays; or the drives are none
         that MuJoCo has; or nothing that a joint moves has a mass.
     """
-    label, file = f'robot description "{path}"', parsed(path, THIN_IN_TEXT)
+    label, file = f'robot description "{path}"', parsed(path, thin=THIN_IN_TEXT)
     spec = file.spec
     for what, elements in (("plugins", spec.plugins), ("soft bodies (flex)", spec.flexes)):
         if len(list(elements)):
@@ -97,8 +99,10 @@ def compiled_text(path: str | Path, actuation: Actuation | None) -> tuple[str, d
     notes = notes_on_simulated(label, compiled, file.flaws)
     for mesh in list(spec.meshes):
         _embed(mesh, compiled)
-    compiled_of(label, spec)
-    return str(spec.to_xml()), drives, notes
+    compiled = compiled_of(label, spec)
+    with without_warnings():
+        text = str(spec.to_xml())  # in which masses are as before they are bounded, or scaled to a total
+    return with_inertials(Document(text.encode(), label), compiled), drives, notes
 
 
 def compiled_of(label: str, source: Any) -> Any:
@@ -122,13 +126,8 @@ def _forget_inertias(spec: Any) -> None:
 
 def _check_state(label: str, compiled: Any) -> None:
     """Raise ModelError where the state is more than positions, velocities and activations."""
-    mujoco = mujoco_module()
-    n_x = compiled.nq + compiled.nv + compiled.na
-    if mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_FULLPHYSICS) > 1 + n_x:
-        raise ModelError(
-            f"{label} has states besides positions, velocities and activations (of delays or plugins): leave these "
-            "out, or give actuation="
-        )
+    if found := further_states(compiled):
+        raise ModelError(f"{label} has states of {', '.join(found)}, which are not simulated here; leave these out")
     if not compiled.nv:
         raise ModelError(f"{label} has no joint: nothing in it moves")
 
@@ -205,6 +204,36 @@ def file_drives(compiled: Any, taken: Collection[str]) -> dict[str, str]:
         name = f"{name}_ctrl" if name in taken else name
         inputs |= {name if n == 1 else f"{name}_{i}": "1" for i in range(n)}
     return inputs
+
+
+def position_targets(compiled: Any, inputs: Sequence[str]) -> dict[str, str]:
+    """Coordinate by the name of each input that is the target of its position: ``force = kp (target - q) - ...``.
+
+    Parameters
+    ----------
+    compiled : mujoco.MjModel
+    inputs : sequence of str
+        Names in the order of MuJoCo's controls.
+    """
+    on_joint, found = mujoco_module().mjtTrn.mjTRN_JOINT, dict[str, str]()
+    if len(compiled.actuator_trntype) != len(inputs):  # an actuator has several controls
+        return found
+    for k in range(len(inputs)):
+        kp, kq = compiled.actuator_gainprm[k][0], compiled.actuator_biasprm[k][1]
+        if compiled.actuator_trntype[k] == on_joint and compiled.actuator_gear[k][0] == 1.0 and kp == -kq > 0.0:
+            found[inputs[k]] = identifier(compiled.joint(compiled.actuator_trnid[k][0]).name)
+    return found
+
+
+def joint_ranges(compiled: Any) -> dict[str, tuple[float, float]]:
+    """Range of each hinge and slide that the file limits, in rad or m."""
+    kinds = mujoco_module().mjtJoint
+    one_axis = np.isin(compiled.jnt_type, [kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE])
+    limited = np.flatnonzero(one_axis & (compiled.jnt_limited != 0) & (np.ptp(compiled.jnt_range, axis=1) > 0.0))
+    return {
+        identifier(compiled.joint(k).name or f"joint_{k}"): tuple(compiled.jnt_range[k].tolist())
+        for k in limited.tolist()
+    }
 
 
 def activations(compiled: Any, taken: Collection[str]) -> dict[str, str]:

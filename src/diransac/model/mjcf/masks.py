@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
@@ -12,103 +12,14 @@ import numpy as np
 
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
+from diransac.model.robots.fields import FIELDS, REPLACED, fields_of, kind_of_actuator, names_of, places_of, rows
 
 if TYPE_CHECKING:
     from diransac.model.mjcf.description import SensorColumns
+    from diransac.model.robots.fields import Field, Number, Place
 
-
-@dataclass(frozen=True)
-class Field:
-    """Field of an element, as masks name it.
-
-    Parameters
-    ----------
-    arrays : tuple of (str, int, float)
-        Arrays of MuJoCo's compiled model that hold it, each with the column of the first entry and a factor.
-    unit : str
-        Of a hinge where a slide has another.
-    sign : str
-        "positive", "non-negative", or "any".
-    size : int, optional
-        Number of entries that an index chooses from.
-    of_slide : str, optional
-        Unit where the joint is a slide.
-    """
-
-    arrays: tuple[tuple[str, int, float], ...]
-    unit: str
-    sign: str = "any"
-    size: int = 1
-    of_slide: str = ""
-
-
-def _own(array: str, unit: str, sign: str = "any", size: int = 1, of_slide: str = "") -> Field:
-    return Field(((array, 0, 1.0),), unit, sign, size, of_slide)
-
-
-_CONTACT = {"solref": (2, "any"), "solimp": (5, "non-negative")}
-FIELDS: dict[str, dict[str, Field]] = {
-    "body": {
-        "mass": _own("body_mass", "kg", "positive"),
-        "ipos": _own("body_ipos", "m", size=3),
-        "inertia": _own("body_inertia", "kg m^2", "positive", 3),
-        "pos": _own("body_pos", "m", size=3),
-        "gravcomp": _own("body_gravcomp", "1"),
-    },
-    "joint": {
-        "armature": _own("dof_armature", "kg m^2", "non-negative", of_slide="kg"),
-        "damping": _own("dof_damping", "N m s/rad", "non-negative", of_slide="N s/m"),
-        "frictionloss": _own("dof_frictionloss", "N m", "non-negative", of_slide="N"),
-        "stiffness": _own("jnt_stiffness", "N m/rad", "non-negative", of_slide="N/m"),
-        "springref": _own("qpos_spring", "rad", of_slide="m"),
-    },
-    "geom": {
-        "friction": _own("geom_friction", "1", "non-negative", 3),
-        **{n: _own(f"geom_{n}", "1", sign, size) for n, (size, sign) in _CONTACT.items()},
-    },
-    "pair": {
-        "friction": _own("pair_friction", "1", "non-negative", 5),
-        **{n: _own(f"pair_{n}", "1", sign, size) for n, (size, sign) in _CONTACT.items()},
-    },
-    "actuator": {
-        "gainprm": _own("actuator_gainprm", "1", size=10),
-        "biasprm": _own("actuator_biasprm", "1", size=10),
-        "dynprm": _own("actuator_dynprm", "1", "non-negative", size=10),
-        "gear": _own("actuator_gear", "1", size=6),
-        "kp": Field((("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)), "N m/rad", "non-negative"),
-        "kv": Field((("actuator_biasprm", 2, -1.0),), "N m s/rad", "non-negative"),
-    },
-    "tendon": {
-        "stiffness": _own("tendon_stiffness", "N/m", "non-negative"),
-        "damping": _own("tendon_damping", "N s/m", "non-negative"),
-        "frictionloss": _own("tendon_frictionloss", "N", "non-negative"),
-    },
-    "equality": {n: _own(f"eq_{n}", "1", sign, size) for n, (size, sign) in _CONTACT.items()},
-    "site": {"pos": _own("site_pos", "m", size=3)},
-    "sensor": {"bias": Field((), "")},
-}
-"""Fields that masks may name, by kind of element."""
-
-ARRAYS = frozenset(array for fields in FIELDS.values() for x in fields.values() for array, _, _ in x.arrays)
-"""Arrays of MuJoCo's compiled model that parameters may be entries of."""
 
 _MASK = re.compile(r"(?P<each>each:)?(?P<kind>\w+)/(?P<name>[^\[\]]+)\.(?P<field>\w+)(?:\[(?P<index>\d+)\])?")
-
-
-@dataclass(frozen=True)
-class Place:
-    """Entry of an array of MuJoCo's compiled model, which is a factor times the parameter.
-
-    Parameters
-    ----------
-    array : str
-    index : tuple of int
-    factor : float, optional
-    """
-
-    array: str
-    index: tuple[int, ...]
-    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -141,6 +52,13 @@ class Unknown:
         found = _MASK.fullmatch(self.name)
         assert found is not None
         return found["field"]
+
+    @property
+    def index(self) -> int:
+        """Index of it in the field."""
+        found = _MASK.fullmatch(self.name)
+        assert found is not None
+        return int(found["index"] or 0)
 
 
 def unknowns_of(
@@ -176,67 +94,77 @@ def unknowns_of(
 
 def _of_mask(label: str, compiled: Any, sensors: Collection[SensorColumns], mask: str) -> Iterator[Unknown]:
     """Parameters of one mask."""
-    parts = _MASK.fullmatch(str(mask))
+    parts, said = _MASK.fullmatch(str(mask)), f'{label}: "{mask}"'
     if parts is None:
         raise ModelError(f'{label}: unknown names {mask!r:.60}; give masks such as "body/trunk.mass"')
-    kind, pattern, each = parts["kind"], parts["name"], parts["each"] is not None
-    fields = FIELDS.get(kind)
-    if fields is None or parts["field"] not in fields:
-        known = ", ".join(FIELDS if fields is None else fields)
-        raise ModelError(f'{label}: "{mask}": there is no {kind}.{parts["field"]}; choose from {known}')
-    field = fields[parts["field"]]
-    if kind == "sensor":
+    kind, pattern, name, each = parts["kind"], parts["name"], parts["field"], parts["each"] is not None
+    if kind == "sensor" and name == "bias":
         yield from _biases(label, sensors, mask, pattern)
         return
-    names, array = _names(compiled, kind), field.arrays[0][0]
-    own = [k for k in range(len(names)) if _rows(compiled, kind, array, k)]
-    matches = [k for k in own if fnmatchcase(names[k], pattern)]
+    fields = _fields(said, compiled, kind, pattern, name)
+    size = max(len(x.numbers) for x in fields.values())
+    indices = range(size) if parts["index"] is None else [int(parts["index"])]
+    if indices[-1] >= size:
+        raise ModelError(f"{said} has the index {indices[-1]}, but {name} has {size} entries")
+    reasons = list[str]()
+    for index in indices:
+        held = {k: x.numbers[index] for k, x in fields.items() if index < len(x.numbers)}
+        reasons += [_absence(compiled, k, x) for k, x in held.items()]
+        present = {k: x for k, x in held.items() if not _absence(compiled, k, x)}
+        for group in [{k: x} for k, x in present.items()] if each else [present] if present else []:
+            named = names_of(compiled, kind)[next(iter(group))] if each else pattern
+            at = f"[{index}]" if size > 1 else ""
+            yield _unknown(compiled, kind, f"{kind}/{named}.{name}{at}", group)
+    if all(reasons):
+        raise ModelError(f"{said}: {reasons[0]}")
+
+
+def _fields(said: str, compiled: Any, kind: str, pattern: str, name: str) -> dict[int, Field]:
+    """A field of the elements that a pattern matches, by index.  Raises ModelError: there is none."""
+    kinds = (*FIELDS, "actuator", "sensor")
+    if kind not in kinds or (kind != "actuator" and name not in FIELDS.get(kind, ())):
+        choice = ", ".join(FIELDS.get(kind, ["bias"]) if kind in kinds else kinds)
+        raise ModelError(f"{said}: there is no {kind}.{name}; choose from {choice}")
+    names = names_of(compiled, kind)
+    every = {k: fields_of(compiled, kind, k) for k in range(len(names))}
+    if kind != "actuator":
+        (array, *_), *_ = FIELDS[kind][name].numbers[0].places
+        every = {k: x for k, x in every.items() if rows(compiled, kind, array, k)}
+    matches = {k: x for k, x in every.items() if fnmatchcase(names[k], pattern)}
     if not matches:
-        raise ModelError(
-            f'{label}: "{mask}" matches nothing; {kind} names are {_listed([names[k] for k in own]) or "none"}'
-        )
-    index = None if parts["index"] is None else int(parts["index"])
-    if index is not None and index >= field.size:
-        raise ModelError(f'{label}: "{mask}" has the index {index}, but {parts["field"]} has {field.size} entries')
-    for group in [[k] for k in matches] if each else [matches]:
-        named = names[group[0]] if each else pattern
-        for entry in range(field.size) if index is None else [index]:
-            at = f"[{entry}]" if field.size > 1 else ""
-            yield _unknown(compiled, (kind, f"{kind}/{named}.{parts['field']}{at}"), field, group, entry)
+        raise ModelError(f"{said} matches nothing; {kind} names are {_listed([names[k] for k in every]) or 'none'}")
+    if found := {k: x[name] for k, x in matches.items() if name in x}:
+        return found
+    k, fields = next(iter(matches.items()))
+    choice = ", ".join(n for n, x in fields.items() if not all(_absence(compiled, k, e) for e in x.numbers))
+    advice = f"give {REPLACED[name]}" if name in REPLACED else f"choose from {choice}"
+    its_kind = kind_of_actuator(compiled, k)
+    raise ModelError(f'{said}: there is no {kind}.{name} of "{names[k]}", of the kind {its_kind}; {advice}')
 
 
-def _unknown(compiled: Any, named: tuple[str, str], field: Field, group: list[int], entry: int) -> Unknown:
-    """The parameter of some elements of a kind, one entry of a field of theirs."""
-    (kind, name), places = named, list[Place]()
-    for array, column, factor in field.arrays:
-        values = getattr(compiled, array)
-        for k in group:
-            for row in _rows(compiled, kind, array, k):
-                at = (row,) if values.ndim == 1 else (row, column + entry)
-                places.append(Place(array, at, factor))
-    first = places[0]
-    value = float(
-        np.median([getattr(compiled, x.array)[x.index] / x.factor for x in places if x.factor == first.factor])
-    )
+def _absence(compiled: Any, k: int, number: Number) -> str:
+    """Reason why a number of an element cannot be identified; empty where it can."""
+    if number.instead:
+        return f"the compiled model has no such entry; give {number.instead}"
+    if number.switch is not None:
+        array, column = number.switch
+        if not np.atleast_1d(getattr(compiled, array)[k])[column]:
+            return "the file has 0 there, by which MuJoCo leaves it out; give it a first value in the file"
+    return ""
+
+
+def _unknown(compiled: Any, kind: str, name: str, group: Mapping[int, Number]) -> Unknown:
+    """The parameter of some elements of a kind, an entry of a field of each."""
+    number, places = next(iter(group.values())), [x for k, n in group.items() for x in places_of(compiled, kind, k, n)]
+    value = float(np.median([getattr(compiled, x.array)[x.index] / x.factor for x in places]))
     slides = kind == "joint" and all(compiled.jnt_type[k] == 2 for k in group)
-    unit = field.of_slide if slides and field.of_slide else field.unit
-    nominal = None if field.sign == "positive" and value <= 0.0 else value
-    bounds = {"lower": 0.0} if field.sign == "non-negative" else {"positive": True} if field.sign == "positive" else {}
-    elements = tuple((kind, _names(compiled, kind)[k]) for k in group)
+    unit = number.of_slide if slides and number.of_slide else number.unit
+    nominal = None if number.sign == "positive" and value <= 0.0 else value
+    bounds = (
+        {"lower": 0.0} if number.sign == "non-negative" else {"positive": True} if number.sign == "positive" else {}
+    )
+    elements = tuple((kind, names_of(compiled, kind)[k]) for k in group)
     return Unknown(name, Parameter(unit, value=nominal, **bounds), tuple(places), elements)
-
-
-def _rows(compiled: Any, kind: str, array: str, k: int) -> list[int]:
-    """Rows of an array that belong to an element; several of a ball joint, none of a free joint and of the world."""
-    if kind == "body" and k == 0:
-        return []
-    if kind != "joint" or array.startswith("jnt_"):
-        return [k]
-    n_dof = {0: 6, 1: 3}.get(int(compiled.jnt_type[k]), 1)
-    if array == "qpos_spring":
-        return [int(compiled.jnt_qposadr[k])] if n_dof == 1 else []
-    first = int(compiled.jnt_dofadr[k])
-    return list(range(first, first + n_dof)) if n_dof < 6 else []
 
 
 def _biases(label: str, sensors: Collection[SensorColumns], mask: str, pattern: str) -> Iterator[Unknown]:
@@ -250,15 +178,6 @@ def _biases(label: str, sensors: Collection[SensorColumns], mask: str, pattern: 
             at = f"[{k}]" if len(one.columns) > 1 else ""
             name = f"sensor/{one.name}.bias{at}"
             yield Unknown(name, Parameter(one.unit, value=0.0), (), (("sensor", one.name),), (column,))
-
-
-def _names(compiled: Any, kind: str) -> list[str]:
-    """Names of all elements of a kind."""
-    counts = {"geom": "ngeom", "joint": "njnt", "body": "nbody", "actuator": "nactuator", "tendon": "ntendon"}
-    counts |= {"pair": "npair", "equality": "neq", "site": "nsite"}
-    if not hasattr(compiled, counts[kind]):  # before MuJoCo 4
-        counts["actuator"] = "nu"
-    return [getattr(compiled, kind)(k).name for k in range(getattr(compiled, counts[kind]))]
 
 
 def _listed(names: Collection[str]) -> str:

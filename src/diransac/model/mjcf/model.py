@@ -17,12 +17,15 @@ from diransac.model.mjcf.description import (
     compiled_text,
     file_drives,
     joint_columns,
+    joint_ranges,
+    position_targets,
     sensor_columns,
 )
-from diransac.model.mjcf.masks import ARRAYS, Place, Unknown, unknowns_of
+from diransac.model.mjcf.masks import Unknown, unknowns_of
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
 from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.fields import ARRAYS, Place
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text
 
@@ -139,6 +142,8 @@ class MujocoModel(Model):
         self._name_signals(name, *groups, "", taken)
         names = [*(n for x in joints for n in x.accelerations), *(f"{n}_dot" for n in first_order)]
         self.accelerations = dict(zip(names, self.accelerations.values(), strict=True))
+        targets = position_targets(compiled, list(inputs))
+        self._name_ranges(joint_ranges(compiled), {n: q for n, q in targets.items() if q in coordinates})
 
     # ------------------------------------------------------------------ what the simulator reads
 

@@ -18,6 +18,9 @@ from diransac.errors import ModelError
 FORCE = "{}_torque"
 """Name of the force of a joint's drive."""
 
+UNKNOWN_GAIN = 'where the {} is not known, give 1, and the unknown "torque_gain", which it then is'
+"""Advice on gains and constants of drives."""
+
 PerJoint: TypeAlias = float | Mapping[str, float]
 
 
@@ -83,7 +86,7 @@ class PositionControl(_Saturating):
     Parameters
     ----------
     kp : float or mapping of str to float
-        Stiffness, N m/rad or N/m.
+        Stiffness, N m/rad or N/m. Where it is not known, 1 with ``kd=0`` and the unknown "torque_gain", which it is.
     kd : float or mapping of str to float, optional
         Damping, N m s/rad or N s/m.
     target : str, optional
@@ -98,7 +101,7 @@ class PositionControl(_Saturating):
     Raises
     ------
     ModelError
-        A gain is negative or not finite, a limit is not positive, or a pattern lacks ``{}``.
+        A gain is missing, negative or not finite, a limit is not positive, or a pattern lacks ``{}``.
     """
 
     kp: PerJoint
@@ -110,6 +113,7 @@ class PositionControl(_Saturating):
 
     def __post_init__(self) -> None:
         _check(self, patterns=("target", "velocity", "feedforward"), positive=("limit",), non_negative=("kp", "kd"))
+        _check_given(self, "kp")
 
     def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
         """Columns of target, its velocity and the feedforward."""
@@ -136,7 +140,8 @@ class MotorCurrents(_Saturating):
     Parameters
     ----------
     constant : float or mapping of str to float
-        Torque constant of the motor, N m/A.
+        Torque constant of the motor, N m/A. Where it, or the gear, is not known, 1 and the unknown "torque_gain", which
+        is gear times constant.
     gear : float or mapping of str to float, optional
         Revolutions of the motor per revolution of the joint; rad/m of a slide.
     current : str, optional
@@ -147,7 +152,8 @@ class MotorCurrents(_Saturating):
     Raises
     ------
     ModelError
-        A number is not finite, a constant or limit is not positive, or the pattern lacks ``{}``.
+        The constant is missing, a number is not finite, a constant or limit is not positive, or the pattern lacks
+        ``{}``.
     """
 
     constant: PerJoint
@@ -157,6 +163,7 @@ class MotorCurrents(_Saturating):
 
     def __post_init__(self) -> None:
         _check(self, patterns=("current",), positive=("constant", "limit"), finite=("gear",))
+        _check_given(self, "constant")
 
     def inputs(self, joint: str, units: tuple[str, str]) -> dict[str, str]:
         """Column of the current."""
@@ -194,6 +201,24 @@ def drive_forces(actuation: Actuation, joints: Collection[str]) -> Callable[...,
         return {name: actuation.force(n, q[n], v[n], u) for name, n in forces.items() if name not in inputs}
 
     return outputs
+
+
+def targets_among(drives: Mapping[str, Mapping[str, str]], units: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Coordinate by the name of each input that is its target, or that of its velocity.
+
+    Parameters
+    ----------
+    drives : mapping of str to mapping of str to str
+        Inputs of each joint's drive, with units.
+    units : mapping of str to (str, str)
+        Units of each joint's position and force.
+    """
+    return {
+        name: joint
+        for joint, own in drives.items()
+        for name, unit in own.items()
+        if unit in (units[joint][0], f"{units[joint][0]}/s")
+    }
 
 
 def _of_joint(what: str, value: PerJoint, joint: str) -> float:
@@ -234,6 +259,12 @@ def _check(
                 raise ModelError(
                     f"{label}: {name} is {number:g}; give a {'positive' if name in positive else 'non-negative'} number"
                 )
+
+
+def _check_given(actuation: object, name: str) -> None:
+    """Raises ModelError: a gain or a constant is None."""
+    if getattr(actuation, name) is None:
+        raise ModelError(f"{type(actuation).__name__}: {name} is None; {UNKNOWN_GAIN.format(name)}")
 
 
 def _is_number(value: object) -> bool:

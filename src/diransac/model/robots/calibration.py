@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +12,17 @@ from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
 from diransac.model.robots.consistency import consistent_parameters, inconsistency
-from diransac.model.robots.description import Description, Joint, read_description
+from diransac.model.robots.description import Description, compiled_file, mujoco_module, read_description
+from diransac.model.robots.document import Document
+from diransac.model.robots.fields import FIELDS, places_of
 from diransac.model.robots.inertias import with_unknown
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters
+from diransac.model.robots.written import refresh, written
+
+_OF_MJCF = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
+"""Attributes of a joint by parameter."""
+_OF_URDF = ("damping", "friction")
+"""Parameters that a joint of a URDF has."""
 
 
 def calibrated(
@@ -49,35 +54,34 @@ def calibrated(
     ------
     ModelError
         The file cannot be read; a joint or body is not in it, but in one that it includes; the parameters are not those
-        of a robot.
+        of a robot; or MuJoCo compiles the text to other values, whatever is written.
     """
     description = read_description(path, "held")
-    source = Path(path).read_bytes()
+    document = Document(Path(path).read_bytes(), f'robot description "{path}"')
     of_joints, of_bodies = _estimates(description, parameters, values, covariance)
-    document = Document(source, f'robot description "{path}"')
-    # Attributes of a joint, and of a URDF joint's dynamics, by parameter.
-    of_mjcf = {"armature": "armature", "damping": "damping", "friction": "frictionloss", "spring": "stiffness"}
-    attributes = {"damping": "damping", "friction": "friction"} if document.is_urdf else of_mjcf
-    texts, placed = dict[str, dict[str, float]](), set[str]()
-    for place, value in of_joints.items():
+    placed = {place for place in of_joints if place.partition(" ")[0] in (_OF_URDF if document.is_urdf else _OF_MJCF)}
+    try:
+        meant, bare = compiled_file(path), False
+    except ModelError:  # files of meshes need not be there
+        meant, bare = compiled_file(path, bare=True), True
+    joints = [x.name for x in description.joints]
+    indices = [k for k in range(meant.njnt) if meant.jnt_type[k] != mujoco_module().mjtJoint.mjJNT_FREE]
+    for place in placed:
         kind, _, name = place.partition(" ")
-        own = texts.setdefault(name, {})
-        if kind in attributes:
-            own[attributes[kind]] = value
-            placed.add(place)
-    joints = {x.name: x for x in description.joints}
-    for name, own in texts.items():
         if name not in joints:
             raise ModelError(f'there is no joint "{name}" in the description')
-        document.set_joint(joints[name], own)
-    for name, inertial in of_bodies.items():
-        document.set_body(name, inertial)
+        _set_joint(document.label, meant, indices[joints.index(name)], _OF_MJCF[kind], of_joints[place])
+    for k, body in enumerate(description.bodies, 1):
+        if body.name in of_bodies:
+            _set_body(meant, k, of_bodies[body.name])
+    refresh(meant)
     left_out = [
         n
         for (n, x), value in zip(parameters.items(), values, strict=True)
         if np.isnan(value) or not (_has_inertials(dict(x.combination)) or x.combination[0][0] in placed)
     ]
-    return document.text(), tuple(left_out)
+    repaired = [i + 1 for i, flaw in description.flaws.items() if flaw.kind == "impossible"]
+    return written(path, document, meant, bare=bare, repaired=repaired), tuple(left_out)
 
 
 def impossible_changes(
@@ -159,151 +163,38 @@ def _combinations(places: list[dict[str, float]]) -> tuple[list[str], list[str],
     return bodies, constants, np.array([[own.get(column, 0.0) for column in columns] for own in places])
 
 
-# ---------------------------------------------------------------------- text
+# ---------------------------------------------------------------------- values in the compiled model
 
 
-@dataclass
-class Element:
-    """Place of an element in the text, in bytes: of its start tag, and of the element."""
-
-    tag: str
-    attributes: dict[str, str]
-    begin: int
-    inside: int
-    end: int
-    children: list[Element]
-
-
-class Document:
-    """Text of a description, in which elements are replaced."""
-
-    def __init__(self, source: bytes, label: str) -> None:
-        self.source, self.label = source, label
-        self.root = _elements(source)
-        self.is_urdf = self.root.tag == "robot"
-        self.changes = dict[tuple[int, int], str]()
-
-    def text(self) -> str:
-        """The text with all changes."""
-        parts, at = list[bytes](), 0
-        for (begin, end), new in sorted(self.changes.items()):
-            parts += [self.source[at:begin], new.encode()]
-            at = end
-        return b"".join([*parts, self.source[at:]]).decode()
-
-    def set_joint(self, joint: Joint, values: Mapping[str, float]) -> None:
-        """Give a joint these attributes; those of a URDF belong to its dynamics."""
-        element = self.named("joint", joint.name)
-        texts = {key: repr(value) for key, value in values.items()}
-        for key, polynomial in (("damping", joint.damping), ("stiffness", joint.stiffness)):
-            if key in texts and len(polynomial) > 1:
-                texts[key] = " ".join([texts[key], *map(repr, polynomial[1:])])
-        if not self.is_urdf:
-            self.rewrite(element, texts)
-        elif dynamics := [x for x in element.children if x.tag == "dynamics"]:
-            self.rewrite(dynamics[0], texts)
-        elif texts:
-            self.insert(element, f"<dynamics {attributes(texts)}/>")
-
-    def set_body(self, name: str, inertial: FloatArray) -> None:
-        """Give a body these inertial parameters about the origin of its frame."""
-        element = self.named("link" if self.is_urdf else "body", name)
-        mass, h = inertial[0], inertial[1:4]
-        centre = h / mass
-        shift = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-        about_centre = inertial[4:] - np.array([*np.diag(shift), shift[0, 1], shift[0, 2], shift[1, 2]])
-        new = (_urdf_inertial if self.is_urdf else _mjcf_inertial)(float(mass), centre, about_centre)
-        if old := [x for x in element.children if x.tag == "inertial"]:
-            self.changes[old[0].begin, old[0].end] = new
-        else:
-            self.insert(element, new)
-
-    def named(self, tag: str, name: str, section: str = "worldbody") -> Element:
-        """The body, link or joint of a name, or any element of another section.  Raises ModelError: there is none."""
-        parents = [self.root] if self.is_urdf else [x for x in self.root.children if x.tag == section]
-        for element in (x for parent in parents for x in _below(parent)):
-            fits = section != "worldbody" or element.tag == tag
-            if fits and element.attributes.get("name") == name:
-                return element
+def _set_joint(label: str, meant: Any, k: int, field: str, value: float) -> None:
+    """Give a joint a value, of which actuators have a part of their own.  Raises ModelError: they have more."""
+    of_drives = _of_drives(meant, k, field)
+    if of_drives > value:
         raise ModelError(
-            f'{self.label}: {tag} "{name}" is not in this file by name; write the files that it includes into one'
+            f'{label}: {field} of joint "{meant.joint(k).name}" is {value:.6g}, but its actuators alone have '
+            f"{of_drives:.6g} behind their gears; lower {field} of the actuators in the file"
         )
-
-    def rewrite(self, element: Element, texts: Mapping[str, str]) -> None:
-        """Replace or add attributes in a start tag."""
-        place = element.begin, element.inside
-        tag = self.changes.get(place, self.source[slice(*place)].decode())
-        for key, text in texts.items():
-            tag, count = re.subn(rf"(\s{key}\s*=\s*)(\"[^\"]*\"|'[^']*')", rf'\g<1>"{text}"', tag, count=1)
-            if not count:
-                tag = re.sub(r"\s*(/?>)$", rf' {key}="{text}"\g<1>', tag)
-        self.changes[place] = tag
-
-    def insert(self, element: Element, new: str) -> None:
-        """Add a first child."""
-        start = self.source[element.begin : element.inside].decode()
-        if start.endswith("/>"):
-            place = element.begin, element.inside
-            self.changes[place] = f"{self.changes.get(place, start)[:-2].rstrip()}>{new}</{element.tag}>"
-        else:
-            place = element.inside, element.inside
-            self.changes[place] = self.changes.get(place, "") + new
+    for place in places_of(meant, "joint", k, FIELDS["joint"][field].numbers[0]):
+        getattr(meant, place.array)[place.index] = value - of_drives
 
 
-def _elements(source: bytes) -> Element:
-    """The root element, with all below it."""
-    parser, open_elements, roots = expat.ParserCreate(), list[Element](), list[Element]()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        begin = parser.CurrentByteIndex
-        inside = _end_of_tag(source, begin)
-        element = Element(tag, attributes, begin, inside, inside, [])
-        (open_elements[-1].children if open_elements else roots).append(element)
-        open_elements.append(element)
-
-    def end(_tag: str) -> None:
-        element, at = open_elements.pop(), parser.CurrentByteIndex
-        if source[element.inside - 2 : element.inside] != b"/>":
-            element.end = source.index(b">", at) + 1
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(source, True)
-    return roots[0]
+def _of_drives(meant: Any, k: int, field: str) -> float:
+    """What actuators add to the armature or damping of a joint, by the square of their gears (MuJoCo 3.7)."""
+    kinds, values = mujoco_module().mjtTrn, getattr(meant, f"actuator_{field}", None)
+    if values is None:
+        return 0.0
+    acts = np.isin(meant.actuator_trntype, (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT))
+    acts &= meant.actuator_trnid[:, 0] == k
+    return float(meant.actuator_gear[acts, 0] ** 2 @ values[acts])
 
 
-def _end_of_tag(source: bytes, begin: int) -> int:
-    """Index behind a start tag, whose attributes may contain ``>``."""
-    match = re.compile(rb"<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*/?>").match(source, begin)
-    assert match is not None
-    return match.end()
-
-
-def _below(element: Element) -> Iterator[Element]:
-    """Elements below one, in order."""
-    for child in element.children:
-        yield child
-        yield from _below(child)
-
-
-def attributes(texts: Mapping[str, str]) -> str:
-    """Attributes of an element."""
-    return " ".join(f"{key}={quoteattr(text)}" for key, text in texts.items())
-
-
-def numbers(values: FloatArray) -> str:
-    """Numbers with all of their digits."""
-    return " ".join(repr(float(x)) for x in np.ravel(values))
-
-
-def _mjcf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
-    """Element of a body, with the inertia about the centre of mass, xx yy zz xy xz yz."""
-    return f'<inertial pos="{numbers(centre)}" mass="{mass!r}" fullinertia="{numbers(inertia)}"/>'
-
-
-def _urdf_inertial(mass: float, centre: FloatArray, inertia: FloatArray) -> str:
-    """Element of a link, with the inertia about the centre of mass, xx yy zz xy xz yz."""
-    entries = zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), inertia.tolist(), strict=True)
-    return (
-        f'<inertial><origin xyz="{numbers(centre)}" rpy="0 0 0"/><mass value="{mass!r}"/>'
-        f"<inertia {attributes({key: repr(x) for key, x in entries})}/></inertial>"
-    )
+def _set_body(meant: Any, k: int, inertial: FloatArray) -> None:
+    """Give a body these inertial parameters about the origin of its frame."""
+    mass, h = inertial[0], inertial[1:4]
+    centre = h / mass
+    xx, yy, zz, xy, xz, yz = inertial[4:]
+    shift = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    principal, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - shift)
+    axes[:, 2] *= np.linalg.det(axes)  # a rotation
+    meant.body_mass[k], meant.body_ipos[k], meant.body_inertia[k] = mass, centre, principal
+    mujoco_module().mju_mat2Quat(meant.body_iquat[k], axes.ravel())

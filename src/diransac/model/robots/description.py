@@ -9,19 +9,20 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.limits import MOST_JOINTS, beyond
-from diransac.model.robots.formats import Outline, check_format, outline, text_for_mujoco
+from diransac.model.robots.formats import Outline, check_format, outline
 from diransac.model.robots.inertias import THIN, Flaw, gives_inertia, repair, without_placeholders
 from diransac.model.robots.sizes import check_description
 from diransac.process import module_path_safe
@@ -49,7 +50,12 @@ class Joint:
     armature : float
         Inertia of the rotor behind the gear, kg m^2 or kg.
     damping, stiffness : tuple of float
-        Coefficients of ``d_0 v + d_1 |v| v + ...`` and of ``k_0 x + k_1 |x| x + ...``.
+        Coefficients of ``d_0 v + d_1 |v| v + d_2 v^3`` and of ``k_0 x + k_1 x^2 + k_2 x^3``: in MuJoCo, the polynomial
+        of damping alone is odd.
+    drive_armature, drive_damping : float
+        What the file's actuators have of the armature, and of the first coefficient of the damping.
+    compensated_by_drive : bool
+        Whether the drive's force has the gravity compensation of the bodies in it.
     friction : float
         Coulomb friction, N m or N.
     spring_reference : float
@@ -65,6 +71,9 @@ class Joint:
     reference: float
     armature: float
     damping: tuple[float, ...]
+    drive_armature: float
+    drive_damping: float
+    compensated_by_drive: bool
     friction: float
     stiffness: tuple[float, ...]
     spring_reference: float
@@ -135,6 +144,8 @@ class Description:
     couplings : tuple of Coupling
     gravity : (3,) array
         In the world frame, m/s^2.
+    compiled : mujoco.MjModel
+        MuJoCo's model of the same tree, without meshes.
     base : int, optional
         Index of a body whose motion is measured; by default no body of those on the world moves by itself.
     flaws : mapping of int to Flaw, optional
@@ -148,6 +159,7 @@ class Description:
     joints: tuple[Joint, ...]
     couplings: tuple[Coupling, ...]
     gravity: FloatArray
+    compiled: Any = field(compare=False, repr=False)
     base: int | None = None
     flaws: Mapping[int, Flaw] = field(default_factory=dict)
     velocity_limits: Mapping[str, float] = field(default_factory=dict)
@@ -190,13 +202,15 @@ class Parsed:
     outline: Outline
 
 
-def parsed(path: str | Path, thin: float = THIN) -> Parsed:
+def parsed(path: str | Path, text: str | None = None, thin: float = THIN) -> Parsed:
     """A description file in MuJoCo's editable form.
 
     Parameters
     ----------
     path : str or Path
         MJCF or URDF.
+    text : str, optional
+        What is read in place of the file's text, as if it stood in the same folder.
     thin : float, optional
         Least second moment of a body over the largest, as of `repair`.
 
@@ -209,17 +223,52 @@ def parsed(path: str | Path, thin: float = THIN) -> Parsed:
     if not Path(path).is_file():
         raise ModelError(f"{label} does not exist; give an MJCF (.xml) or URDF file")
     check_description(Path(path), label)
-    text = outline(path)
-    check_format(text, path, label)
+    source = Path(path).read_bytes() if text is None else text.encode()
+    own = outline(source)
+    check_format(own, path, label)
+    content = own.completed(source)
+    is_read = text is None and content == source and Path(path).suffix in (".xml", ".urdf")  # by MuJoCo, by itself
     try:
         with without_warnings():
-            content = text_for_mujoco(text, path)
-            spec = mujoco.MjSpec.from_file(str(path)) if content is None else mujoco.MjSpec.from_string(content)
-            if content is not None:
-                spec.modelfiledir = str(Path(path).parent)
+            if is_read:
+                spec = mujoco.MjSpec.from_file(str(path))
+            else:
+                name = uuid4().hex + (".urdf" if own.root == "robot" else ".xml")  # of a file that is not there
+                spec = mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: content})
     except _FAILURES as error:
         raise _unreadable(path, error) from error
-    return Parsed(spec, repair(spec, is_urdf=text.root == "robot", thin=thin), text)
+    return Parsed(spec, repair(spec, is_urdf=own.root == "robot", thin=thin), own)
+
+
+def compiled_file(path: str | Path, text: str | None = None, *, bare: bool = False) -> Any:
+    """MuJoCo's compiled model of a file, with all of its bodies.
+
+    Parameters
+    ----------
+    path, text
+        As for `parsed`.
+    bare : bool, optional
+        Without shapes that give no inertia, whose files need not be there.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read or compiled.
+    """
+    spec = parsed(path, text).spec
+    if bare:
+        drop_shapes(spec)
+    return _compiled(path, spec)
+
+
+def _compiled(path: str | Path, spec: Any) -> Any:
+    """MuJoCo's model of its editable form, with all of its bodies."""
+    spec.compiler.fusestatic = False
+    try:
+        with without_warnings():
+            return spec.compile()
+    except _FAILURES as error:
+        raise _missing_mesh(path, spec, error) or _unreadable(path, error) from error
 
 
 def read_description(path: str | Path, base: str | None = None) -> Description:
@@ -236,8 +285,8 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
     Raises
     ------
     ModelError
-        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, a tendon
-        that exerts forces, or a surrounding fluid.
+        The file cannot be read; or it has a free joint whose base is neither, a ball joint, a closed loop, or springs
+        or constraints of other kinds than those of joints.
     """
     try:
         return _description(path, base)
@@ -247,33 +296,58 @@ def read_description(path: str | Path, base: str | None = None) -> Description:
 
 def _description(path: str | Path, base: str | None) -> Description:
     """As `read_description`.  Raises UnicodeDecodeError: a name is not UTF-8."""
-    file = parsed(path)
+    label, file = f'robot description "{path}"', parsed(path)
     spec = file.spec
-    floating = [x for x in spec.joints if x.type == mujoco_module().mjtJoint.mjJNT_FREE] if base else []
-    names = [joint.parent.name for joint in floating]
-    for joint in floating:
-        spec.delete(joint)
     drives = _drive_limits(spec)
-    _drop_shapes(spec)
-    try:
-        spec.compiler.fusestatic = False
-        with without_warnings():
-            model = spec.compile()
-    except _FAILURES as error:
-        raise _missing_mesh(path, spec, error) or _unreadable(path, error) from error
-    label = f'robot description "{path}"'
-    _check_supported(label, model)
+    drop_shapes(spec)
+    model = _compiled(path, spec)
     if model.njnt > MOST_JOINTS:
         raise ModelError(f"{label}: it has {beyond(MOST_JOINTS, 'joints', model.njnt)}; split the robot")
-    joints = tuple(_joint(model, k, drives) for k in range(model.njnt))
-    if not joints:
+    _check_supported(label, model, base)
+    found = described(label, model, drives, re.sub(r"\W+", "-", spec.modelname) or Path(path).stem)
+    if not found.joints:
         raise ModelError(f"{label}: there are no joints, and nothing can move")
     flaws = {body.id - 1: flaw for body, flaw in file.flaws}
-    bodies = without_placeholders(tuple(_body(model, i) for i in range(1, model.nbody)), flaws)
-    name = re.sub(r"\W+", "-", spec.modelname) or Path(path).stem
-    measured = _measured_base(label, bodies, names) if base == "measured" else None
-    couplings, gravity = tuple(_couplings(label, model)), np.array(model.opt.gravity)
-    return Description(name, bodies, joints, couplings, gravity, measured, flaws, file.outline.velocity_limits)
+    return replace(
+        found,
+        bodies=without_placeholders(found.bodies, flaws),
+        base=_measured_base(label, found) if base == "measured" else None,
+        flaws=flaws,
+        velocity_limits=file.outline.velocity_limits,
+    )
+
+
+def described(label: str, model: Any, drives: Mapping[str, tuple[float, float]], name: str) -> Description:
+    """Tree of a compiled model, in which free joints hold their bodies in the pose of the file.
+
+    Parameters
+    ----------
+    label : str
+        Of the file in messages.
+    model : mujoco.MjModel
+    drives : mapping of str to (float, float)
+        Range of the forces of a joint's drives, by its name.
+    name : str
+        Of the robot.
+
+    Raises
+    ------
+    ModelError
+        An equality constraint closes a loop.
+    """
+    bits, flags = mujoco_module().mjtDisableBit.__members__.values(), int(model.opt.disableflags)
+    without = {bit.name.removeprefix("mjDSBL_").lower() for bit in bits if flags & bit.value}
+    moved = moved_joints(model)
+    joints = tuple(_joint(model, k, drives, without) for k in moved)
+    bodies = tuple(_body(model, i, moved, without) for i in range(1, model.nbody))
+    couplings = () if without & {"constraint", "equality"} else tuple(_couplings(label, model, moved))
+    gravity = np.zeros(3) if "gravity" in without else np.array(model.opt.gravity)
+    return Description(name, bodies, joints, couplings, gravity, model)
+
+
+def moved_joints(model: Any) -> list[int]:
+    """Indices of the joints of a compiled model that are not free, in the order in which a description has them."""
+    return np.flatnonzero(model.jnt_type != int(mujoco_module().mjtJoint.mjJNT_FREE)).tolist()
 
 
 @contextmanager
@@ -293,13 +367,15 @@ def without_warnings() -> Iterator[None]:
             mujoco.set_mju_user_warning(before)
 
 
-def _measured_base(label: str, bodies: Sequence[Body], floating: Sequence[str]) -> int:
+def _measured_base(label: str, description: Description) -> int:
     """Index of the body with a free joint.  Raises ModelError: there is not one, or weights are compensated."""
-    if len(floating) != 1:
-        raise ModelError(f"{label}: {len(floating)} bodies have a free joint; a measured base takes one")
-    if any(body.gravity_compensation for body in bodies):
+    model = description.compiled
+    free = np.flatnonzero(model.jnt_type == int(mujoco_module().mjtJoint.mjJNT_FREE))
+    if len(free) != 1:
+        raise ModelError(f"{label}: {len(free)} bodies have a free joint; a measured base takes one")
+    if any(body.gravity_compensation for body in description.bodies):
         raise ModelError(f"{label}: gravity compensation on a base whose attitude is not known is not modelled")
-    return [body.name for body in bodies].index(floating[0])
+    return int(model.jnt_bodyid[free[0]]) - 1
 
 
 def _unreadable(path: str | Path, error: Exception) -> ModelError:
@@ -319,26 +395,25 @@ def _missing_mesh(path: str | Path, spec: Any, error: Exception) -> ModelError |
     )
 
 
-def _drop_shapes(spec: Any) -> None:
-    """Remove shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
+def drop_shapes(spec: Any) -> None:
+    """Remove looks, shapes that give no inertia, and what refers to shapes: files of meshes need not be there."""
     mujoco = mujoco_module()
-    by_shapes = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    wrapped = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CYLINDER) if list(spec.tendons) else ()
-    for referring in (spec.pairs, spec.sensors, spec.actuators, spec.keys, spec.skins, spec.lights):
-        for element in list(referring):
-            spec.delete(element)
-    for shape in (x for x in spec.geoms if x.type not in wrapped):
-        own = shape.parent
-        counts = _moves(own) or spec.compiler.settotalmass > 0.0  # which scales all masses
-        if not (counts and gives_inertia(spec, shape)) or (own.explicitinertial and not by_shapes):
-            spec.delete(shape)
-    for shape in (*spec.geoms, *spec.sites, *spec.tendons):
-        shape.material = ""
+    for element in (*spec.geoms, *spec.sites, *spec.tendons, *spec.flexes):
+        element.material = ""
+    _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.lights, spec.materials, spec.textures)
+    spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE  # lengths of muscles, which MuJoCo simulates
+    wrapped = {x.target.name for tendon in spec.tendons for x in getattr(tendon, "path", ())}
+    _delete(spec, [shape for shape in spec.geoms if shape.name not in wrapped and not _counts(spec, shape)])
     needed = {name for shape in spec.geoms for name in (shape.meshname, shape.hfieldname)}
-    for mesh in (x for x in (*spec.meshes, *spec.hfields) if x.name not in needed):
-        spec.delete(mesh)
-    for unused in (*spec.materials, *spec.textures):
-        spec.delete(unused)
+    _delete(spec, [x for x in (*spec.meshes, *spec.hfields) if x.name not in needed])
+
+
+def _counts(spec: Any, shape: Any) -> bool:
+    """Whether a shape gives its body an inertia that has an effect."""
+    rule, body = spec.compiler.inertiafromgeom, shape.parent
+    if body.explicitinertial and rule != mujoco_module().mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return False
+    return gives_inertia(spec, shape) and (_moves(body) or spec.compiler.settotalmass > 0.0)  # which scales all masses
 
 
 def _moves(body: Any) -> bool:
@@ -346,33 +421,61 @@ def _moves(body: Any) -> bool:
     return body.parent is not None and (bool(list(body.joints)) or _moves(body.parent))
 
 
-def _check_supported(label: str, model: Any) -> None:
+def _delete(spec: Any, *groups: Iterable[Any]) -> None:
+    for element in [x for group in groups for x in group]:
+        spec.delete(element)
+
+
+_STATES = {
+    "TIME", "QPOS", "QVEL", "ACT", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE", "MOCAP_POS",
+    "MOCAP_QUAT", "USERDATA",
+}  # fmt: skip
+"""Parts of MuJoCo's state that are those of joints, drives and users."""
+_ATTRIBUTES = {"HISTORY": "delays (delay, nsample)", "PLASTIC": "springs that yield (springyield)", "PLUGIN": "plugins"}
+"""Attributes from which further parts come."""
+_CONSTRAINTS = ("EQUALITY", "FRICTION_DOF", "LIMIT", "CONTACT")
+"""Beginnings of the names of MuJoCo's constraints that are couplings, friction of joints, or no part of the model."""
+
+
+def _check_supported(label: str, model: Any, base: str | None) -> None:
     """Raises ModelError: the robot has parts for which there are no equations here, or numbers that overflow."""
+    mujoco = mujoco_module()
     of_bodies = (model.body_mass, model.body_inertia, model.body_ipos, model.body_pos)
     of_joints = (model.dof_armature, model.dof_damping, model.dof_frictionloss, model.jnt_stiffness, model.jnt_pos)
     largest = 1e50  # products of several of them do not overflow
     if not all(np.all(np.abs(x) < largest) for x in (*of_bodies, *of_joints)):
         raise ModelError(f"{label}: a mass, inertia, position or coefficient is {largest:g} or more; correct it")
-    kinds = mujoco_module().mjtJoint
     for k in range(model.njnt):
         name = model.joint(k).name
-        if model.jnt_type[k] == kinds.mjJNT_FREE:
+        if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_FREE and base is None:
             raise ModelError(
                 f'{label}: the base floats (free joint "{name}"); give base="held" if it was held while the '
                 'log was recorded, or base="measured" if its motion was'
             )
-        if model.jnt_type[k] == kinds.mjJNT_BALL:
+        if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_BALL:
             raise ModelError(f'{label}: joint "{name}" is a ball joint; replace it by three hinges')
-    forces = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss)
-    if model.ntendon and any(np.any(x) for x in (*forces, getattr(model, "tendon_armature", 0.0))):
-        raise ModelError(
-            f"{label}: tendons with stiffness, damping, friction or armature are not modelled; remove them"
-        )
-    if model.opt.density or model.opt.viscosity:
-        raise ModelError(f"{label}: forces of a surrounding fluid are not modelled; remove density and viscosity")
+    if found := further_states(model, {"HISTORY"}):  # drives' delays are those of their forces
+        raise ModelError(f"{label} has {', '.join(found)}, for which there are no equations here; leave them out")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for row in data.efc_type[: data.nefc]:
+        kind = mujoco.mjtConstraint(int(row)).name.removeprefix("mjCNSTR_")
+        if not kind.startswith(_CONSTRAINTS):
+            words = " of a ".join(kind.lower().split("_"))
+            raise ModelError(f"{label}: the {words} is not modelled; leave it out (of joints, it is modelled)")
 
 
-def _couplings(label: str, model: Any) -> Iterator[Coupling]:
+def further_states(model: Any, known: Collection[str] = ()) -> list[str]:
+    """What gives a compiled model states besides those of joints, activations, and `known` names of MuJoCo's parts."""
+    mujoco, found = mujoco_module(), list[str]()
+    for name, part in mujoco.mjtState.__members__.items():
+        kind, is_one = name.removeprefix("mjSTATE_"), name != "mjNSTATE" and part.value & (part.value - 1) == 0
+        if is_one and kind not in _STATES | set(known) and mujoco.mj_stateSize(model, part.value):
+            found.append(_ATTRIBUTES.get(kind, kind))
+    return found
+
+
+def _couplings(label: str, model: Any, moved: list[int]) -> Iterator[Coupling]:
     """Active equality constraints.  Raises ModelError: one is not between joints, which closes a kinematic loop."""
     mujoco = mujoco_module()
     for k in np.flatnonzero(model.eq_active0):
@@ -382,8 +485,9 @@ def _couplings(label: str, model: Any) -> Iterator[Coupling]:
                 f'{label}: the equality constraint "{model.equality(k).name or k}" ({kind}) closes a kinematic loop, '
                 "and only chains and trees are modelled; cut the loop, or couple its joints by polynomials"
             )
-        leader = int(model.eq_obj2id[k])
-        yield Coupling(int(model.eq_obj1id[k]), None if leader < 0 else leader, tuple(model.eq_data[k, :5].tolist()))
+        follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        own = None if leader < 0 else moved.index(leader)
+        yield Coupling(moved.index(follower), own, tuple(model.eq_data[k, :5].tolist()))
 
 
 def _drive_limits(spec: Any) -> dict[str, tuple[float, float]]:
@@ -402,50 +506,76 @@ def _drive_limits(spec: Any) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _joint(model: Any, k: int, drives: Mapping[str, tuple[float, float]]) -> Joint:
+def _joint(model: Any, k: int, drives: Mapping[str, tuple[float, float]], without: Collection[str]) -> Joint:
+    """Joint of an index; ``without`` names the flags by which the file disables springs, dampers, constraints."""
     dof, name, unlimited = model.jnt_dofadr[k], model.joint(k).name, (-np.inf, np.inf)
     low, high = drives.get(name, unlimited)
     if model.jnt_actfrclimited[k]:
         low, high = max(low, float(model.jnt_actfrcrange[k][0])), min(high, float(model.jnt_actfrcrange[k][1]))
+    rotor, drag = _of_drives(model, k)
+    own = _coefficients(model, "dof_damping", dof)
     return Joint(
         name=name or f"joint{k}",
         turns=bool(model.jnt_type[k] == mujoco_module().mjtJoint.mjJNT_HINGE),
         axis=_snapped(model.jnt_axis[k]),
         anchor=np.array(model.jnt_pos[k]),
         reference=float(model.qpos0[model.jnt_qposadr[k]]),
-        armature=float(model.dof_armature[dof]),
-        damping=_polynomial(model.dof_damping[dof], getattr(model, "dof_dampingpoly", None), dof),
-        friction=float(model.dof_frictionloss[dof]),
-        stiffness=_polynomial(model.jnt_stiffness[k], getattr(model, "jnt_stiffnesspoly", None), k),
+        armature=float(model.dof_armature[dof]) + rotor,
+        damping=(0.0,) if "damper" in without else _trimmed(own + drag),
+        drive_armature=rotor,
+        drive_damping=0.0 if "damper" in without else float(drag[0]),
+        compensated_by_drive=bool(model.jnt_actgravcomp[k]),
+        friction=0.0 if {"constraint", "frictionloss"} & set(without) else float(model.dof_frictionloss[dof]),
+        stiffness=(0.0,) if "spring" in without else _trimmed(_coefficients(model, "jnt_stiffness", k)),
         spring_reference=float(model.qpos_spring[model.jnt_qposadr[k]]),
         position_limits=tuple(model.jnt_range[k].tolist()) if model.jnt_limited[k] else unlimited,
         force_limits=(low, high),
     )
 
 
-def _polynomial(first: float, others: FloatArray | None, k: int) -> tuple[float, ...]:
-    """Coefficients without zeros at the end; versions of MuJoCo before 3.5 have the first alone."""
-    found = [float(first), *([] if others is None else others[k].tolist())]
+def _of_drives(model: Any, k: int) -> tuple[float, FloatArray]:
+    """Armature and coefficients of damping that the file's actuators give a joint, by the square of the gear."""
+    rotor, drag = 0.0, np.zeros(3)
+    if not hasattr(model, "actuator_armature"):  # before MuJoCo 3.7
+        return rotor, drag
+    of_joints = [int(getattr(mujoco_module().mjtTrn, f"mjTRN_{x}")) for x in ("JOINT", "JOINTINPARENT")]
+    for i in np.flatnonzero(model.actuator_trnid[:, 0] == k).tolist():
+        if model.actuator_trntype[i] in of_joints:
+            gear = abs(float(model.actuator_gear[i, 0]))
+            rotor += gear**2 * float(model.actuator_armature[i])
+            drag += gear**2 * _coefficients(model, "actuator_damping", i)
+    return rotor, drag
+
+
+def _coefficients(model: Any, array: str, k: int) -> FloatArray:
+    """The three coefficients of a polynomial force; versions of MuJoCo before 3.7 have the first alone."""
+    others = getattr(model, f"{array}poly", None)
+    return np.array([getattr(model, array)[k], *([0.0, 0.0] if others is None else others[k])], float)
+
+
+def _trimmed(coefficients: FloatArray) -> tuple[float, ...]:
+    """Coefficients without zeros at the end."""
+    found = coefficients.tolist()
     while len(found) > 1 and found[-1] == 0.0:
         found.pop()
     return tuple(found)
 
 
-def _body(model: Any, i: int) -> Body:
+def _body(model: Any, i: int, moved: list[int], without: Collection[str]) -> Body:
+    """Body of an index; ``without`` as in `_joint`: without springs and dampers, MuJoCo has no passive force at all."""
     centre, mass = np.array(model.body_ipos[i]), float(model.body_mass[i])
     axes = _rotation(model.body_iquat[i])
     about_centre = axes @ np.diag(0.5 * model.body_inertia[i].sum() - model.body_inertia[i]) @ axes.T
     second, first_moments = about_centre + mass * np.outer(centre, centre), (mass * centre)[:, None]
     inertial = np.block([[second, first_moments], [first_moments.T, np.array([[mass]])]])
-    first = int(model.body_jntadr[i])
     return Body(
         name=model.body(i).name or f"body{i}",
         parent=int(model.body_parentid[i]) - 1,
         rotation=_rotation(model.body_quat[i]),
         position=np.array(model.body_pos[i]),
-        joints=tuple(range(first, first + int(model.body_jntnum[i]))),
+        joints=tuple(j for j, k in enumerate(moved) if model.jnt_bodyid[k] == i),
         inertial=inertial,
-        gravity_compensation=float(model.body_gravcomp[i]),
+        gravity_compensation=0.0 if {"spring", "damper"} <= set(without) else float(model.body_gravcomp[i]),
     )
 
 

@@ -43,14 +43,22 @@ class Outline:
     velocity_limits: dict[str, float] = field(default_factory=dict)
     gaps: dict[int, str] = field(default_factory=dict)
 
+    def completed(self, source: bytes) -> bytes:
+        """The text with what inertials lack, without which MuJoCo does not read them."""
+        parts, at = list[bytes](), 0
+        for place, text in self.gaps.items():
+            parts += [source[at:place], text.encode()]
+            at = place
+        return b"".join([*parts, source[at:]])
 
-def outline(path: str | Path) -> Outline:
+
+def outline(source: bytes) -> Outline:
     """Outline of a description; of text that is no XML, up to where it is.
 
     Parameters
     ----------
-    path : str or Path
-        File that `check_description` lets pass.
+    source : bytes
+        Text that `check_description` lets pass.
     """
     found, joints, parts = Outline(), [""], set[str]()
 
@@ -76,24 +84,8 @@ def outline(path: str | Path) -> Outline:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = start, end
     with suppress(expat.ExpatError, ValueError):  # of encodings that it does not know
-        parser.Parse(Path(path).read_bytes(), True)
+        parser.Parse(source, True)
     return found
-
-
-def text_for_mujoco(found: Outline, path: str | Path) -> str | None:
-    """Text of a description that MuJoCo would not read from its file; None where it would.
-
-    It reads files of two endings alone, and no inertial of a URDF without a mass or without an inertia.
-
-    Raises UnicodeDecodeError: the text is not UTF-8.
-    """
-    if Path(path).suffix in (".xml", ".urdf") and not found.gaps:
-        return None
-    source, parts, at = Path(path).read_bytes(), list[bytes](), 0
-    for place, text in found.gaps.items():
-        parts += [source[at:place], text.encode()]
-        at = place
-    return b"".join([*parts, source[at:]]).decode()
 
 
 def check_format(found: Outline, path: str | Path, label: str) -> None:

@@ -22,7 +22,7 @@ from diransac.model.derivation import Symbols
 from diransac.model.held import HeldConstant
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
-from diransac.model.robots.actuation import Actuation
+from diransac.model.robots.actuation import Actuation, targets_among
 from diransac.model.robots.description import Coupling, Description, Joint
 from diransac.model.robots.rigid_body import INERTIAL_NAMES, inertial_parameters, inverse_dynamics, pseudo_inertia
 
@@ -93,14 +93,18 @@ class Mechanism:
             return [ca.cse(ca.vertcat(*forces.values()))]
 
         units = {n: ("rad", "N m") if self._joint(n).turns else ("m", "N") for n in self.coordinates}
+        drives = {n: actuation.inputs(n, units[n]) for n in driven}
+        limits = {n: self._joint(n).position_limits for n in self.coordinates}
         model = Model(
             name=self.description.name,
             description=f"robot with {len(units)} joints, from its description",
             coordinates={n: position for n, (position, _) in units.items()},
-            inputs={key: unit for n in driven for key, unit in actuation.inputs(n, units[n]).items()}
+            inputs={name: unit for own in drives.values() for name, unit in own.items()}
             | {n: unit for names, unit in zip(self._base_inputs, _BASE.values(), strict=False) for n in names},
             parameters=self.parameters(driven),
             equations=equations,
+            ranges={n: x for n, x in limits.items() if np.isfinite(x).all() and x[0] < x[1]},
+            targets=targets_among(drives, units),
         )
         model.held_by = self.held
         return model
@@ -233,7 +237,7 @@ class Mechanism:
 
         ``changes`` are those of the mass of some bodies at its centre, kg, and of the inertia about it, over its value.
         """
-        motions = self._motions(q, v, a)
+        motions = self.motions(q, v, a)
         inertials = [self._inertial(i, values) for i in range(len(self.description.bodies))]
         for i, (mass, inertia) in ((i, ca.vertsplit(x)) for i, x in (changes or {}).items()):
             J = self.description.bodies[i].inertial
@@ -255,7 +259,7 @@ class Mechanism:
             force += unknown.get(f"{kind}_{x.coordinate}", nominal[kind]) * signal
         stretch = x.q - joint.spring_reference
         force += sum(c * ca.fabs(x.v) ** k * x.v for k, c in enumerate(joint.damping[1:], 1))
-        return force + sum(c * ca.fabs(stretch) ** k * stretch for k, c in enumerate(joint.stiffness[1:], 1))
+        return force + sum(c * stretch ** (k + 1) for k, c in enumerate(joint.stiffness[1:], 1))
 
     def _inertial(self, i: int, values: Mapping[str, Any]) -> Any:
         """Pseudo-inertia of a body."""
@@ -264,8 +268,8 @@ class Mechanism:
             return body.inertial
         return pseudo_inertia([values[f"{kind}_{identifier(body.name)}"] for kind in INERTIAL_NAMES])
 
-    def _motions(self, q: Any, v: Any, a: Any) -> list[_Motion]:
-        """Motion of every joint of the description: of a coordinate, coupled to one, or none."""
+    def motions(self, q: Any, v: Any, a: Any) -> list[_Motion]:
+        """Motion of every joint of the description, from those of the coordinates: its own, coupled to one, or none."""
         found = [_Motion(joint.reference, 0.0, 0.0, 0.0, None) for joint in self.description.joints]
         for n, k in self.coordinates.items():
             found[k] = _Motion(q[n], v[n], a[n], 1.0, n)

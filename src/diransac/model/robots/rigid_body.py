@@ -111,8 +111,14 @@ def inverse_dynamics(
         for k in body.joints:
             motion = _moved(motion, description.joints[k], q[k], v[k], a[k])
         motions.append(motion)
-    parts = zip(description.bodies, _lumped(description.bodies, inertials), motions, strict=True)
-    return _joint_forces(description, q, [_inertial_force(body, J, motion) for body, J, motion in parts])
+    parts = list(zip(_lumped(description.bodies, inertials), motions, strict=True))
+    shares = [body.gravity_compensation for body in description.bodies]
+    found = _joint_forces(description, q, [_inertial_force(*x, share) for x, share in zip(parts, shares, strict=True)])
+    if any(shares) and any(joint.compensated_by_drive for joint in description.joints):
+        whole = _joint_forces(description, q, [_inertial_force(*part, 0.0) for part in parts])
+        pairs = zip(description.joints, found, whole, strict=True)
+        found = [all_of_it if joint.compensated_by_drive else rest for joint, rest, all_of_it in pairs]
+    return found
 
 
 def position_of(description: Description, body: int, point: Sequence[float], q: Sequence[Any]) -> ca.SX:
@@ -186,14 +192,14 @@ def _moved(motion: _Motion, joint: Joint, q: Any, v: Any, a: Any) -> _Motion:
     return at_anchor._replace(a=at_anchor.at(-anchor))
 
 
-def _inertial_force(body: Body, J: Any, motion: _Motion) -> _Force:
-    """Force and moment about its origin that a body's motion takes, with its weight."""
+def _inertial_force(J: Any, motion: _Motion, compensation: float) -> _Force:
+    """Force and moment about its origin that a body's motion takes, with what is not compensated of its weight."""
     w, dw, a, g = motion
     S, h, m = J[:3, :3], ca.SX(J[:3, 3]), J[3, 3]
     inertia = ca.SX(ca.trace(ca.SX(S)) * ca.SX.eye(3) - S)
     f = m * a + ca.cross(dw, h) + ca.cross(w, ca.cross(w, h))
     n = inertia @ dw + ca.cross(w, inertia @ w) + ca.cross(h, a)
-    lift = body.gravity_compensation * g
+    lift = compensation * g
     return _Force(f + m * lift, n + ca.cross(h, lift))
 
 

@@ -13,11 +13,17 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.model import Model
-from diransac.model.robots.actuation import FORCE, Actuation, JointTorques
+from diransac.model.robots.actuation import FORCE, UNKNOWN_GAIN, Actuation, JointTorques
 from diransac.model.robots.description import Description, read_description
 from diransac.model.robots.inertias import moving_bodies, notes_on_inertias, with_unknown
 from diransac.model.robots.mechanism import UNKNOWN, Mechanism, followed, identifier, ordered_couplings
+from diransac.model.robots.reference import check_forces
 from diransac.model.robots.rigid_body import position_of
+from diransac.text_table import some
+
+_OF_BODIES = re.compile(r"(mass|inertia|com|ipos|cent(re|er)|payload|h[xyz]|i[xyz]{2})(_|$)", re.IGNORECASE)
+_OF_DRIVES = re.compile(r"(kp|kd|kv|kt|constant|gear|gain)(_|$)", re.IGNORECASE)
+"""Names that people give to parameters that are not those of joints."""
 
 
 def robot(
@@ -103,6 +109,7 @@ def robot(
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity, "gravity"))
     label = f'robot "{path}"'
+    check_forces(label, description)
     coordinates = _coordinates(label, description, joints)
     moved = set(coordinates.values())
     for coupling in ordered_couplings(label, description):
@@ -113,7 +120,7 @@ def robot(
         label=label,
         description=with_unknown(description, chosen),
         coordinates=coordinates,
-        unknown=_known_names("unknown", unknown, UNKNOWN),
+        unknown=_unknown_of_joints(unknown, description),
         bodies=chosen,
         speeds=(_positive("friction_speed", friction_speed), _positive("stribeck_speed", stribeck_speed)),
     )
@@ -276,6 +283,22 @@ def _known_names(what: str, given: Collection[str], known: Collection[str]) -> t
         if name not in known:
             raise ModelError(f"{what}: there is no {name!r}; choose from {', '.join(known)}")
     return names
+
+
+def _unknown_of_joints(given: Collection[str], description: Description) -> tuple[str, ...]:
+    """Names of unknown parameters of joints.  Raises ModelError: one is unknown, or has its place elsewhere."""
+    for name in (given,) if isinstance(given, str) else given:
+        elsewhere = ""
+        if "/" in name:
+            elsewhere = "is a mask: dr.models.mujoco takes it (--simulator mujoco)"
+        elif _OF_BODIES.match(name):
+            bodies = some(body.name for body in description.bodies)
+            elsewhere = f'belongs to bodies: name these with bodies= (--bodies), "all" or some of {bodies}'
+        elif _OF_DRIVES.match(name):
+            elsewhere = f"is a gain of a drive: {UNKNOWN_GAIN.format('gain')}"
+        if elsewhere:
+            raise ModelError(f"unknown: {name!r} {elsewhere}; parameters of joints are {', '.join(UNKNOWN)}")
+    return _known_names("unknown", given, UNKNOWN)
 
 
 def _coordinates(

@@ -28,7 +28,13 @@ from diransac.identification.methods.lo_diransac.projection import (
     projected_candidates,
     with_parameters,
 )
-from diransac.identification.methods.lo_diransac.search import Decided, Searched, likeliest, searched
+from diransac.identification.methods.lo_diransac.search import (
+    Decided,
+    Searched,
+    likeliest,
+    prospects_of,
+    searched,
+)
 from diransac.identification.methods.lo_diransac.segments import ActingInputs, inlying_samples
 from diransac.identification.methods.lo_diransac.simulation_error import simulation_error_candidates
 from diransac.identification.methods.lo_diransac.sources import (
@@ -80,7 +86,8 @@ def compete(
     """The likeliest explanation of the logs, `prepared`, with the estimate that predicts best.
 
     Where no search from samples succeeds, or its fit is challenged, another one begins with the best of the other
-    estimates; the likeliest counts.
+    estimates; the likeliest counts.  Not so where the equations hold with impossible parameters alone, which no search
+    changes.
 
     Raises
     ------
@@ -90,10 +97,15 @@ def compete(
         The time limit was reached before a search had converged.
     """
     first, refusal, (intervals, motion, notes) = None, None, whole
+    prospects = prospects_of(dataset, intervals, motion)
+    for warning in prospects.sentences():
+        report(callback, "least squares of all rows", 0.05, warning=warning)
     try:
         first = likeliest(settings, dataset, seed, callback, whole)
     except (IdentificationError, np.linalg.LinAlgError) as error:
         refusal = error
+        if prospects.contradict_bounds:
+            raise
     else:
         if not first.likeliest.complete or is_settled(first.likeliest, first.motion):
             return first
@@ -208,13 +220,13 @@ class Contest:
         return [*found, *(replace(x, motion=motion) for x, motion in simulated)]
 
     def is_challenged(self, search: Searched, rival: Candidate) -> bool:
-        """True if a fit is exact although its noise is not white, or if a rival contradicts its estimate.
+        """True if a fit is exact although its noise is not white, or if a rival contradicts an estimate that counts.
 
         Two estimates contradict each other if their 95 % intervals of a parameter are disjoint.
         """
         errors = np.sqrt(np.diag(jackknife(rival.without))) + np.sqrt(np.diag(search.result.covariance))
         apart = np.abs(rival.parameters - search.result.parameters)
-        return search.likeliest.exact or bool((apart > 1.96 * errors).any())
+        return search.likeliest.exact or bool((apart > 1.96 * errors).any() and search.likeliest.is_comparable)
 
     def _searched_from(self, rival: Candidate, first: Searched | None) -> Searched | None:
         """A search from an estimate that no fit gave, and its simulated motion; None where it fails."""

@@ -67,6 +67,8 @@ _EXPLAINS = float(np.log(1.25))
 """Log of the factor by which an error of a recording must lower unmodelled accelerations."""
 _EXPLAINS_DRIFT = float(np.log(4.0))
 """The same of a drift."""
+_LABORIOUS = 1e6
+"""Rows, times integration steps and unknowns, of a fit from which on its steps take a large part of a second each."""
 _CONTINUOUS = (-0.9, -0.1)
 """Delays, samples, of held inputs that vary between samples."""
 
@@ -92,6 +94,16 @@ class Explanation:
     def intervals(self) -> Windows:
         """The logs, with the most probable errors of the recordings."""
         return self.refinement.intervals
+
+    @property
+    def is_comparable(self) -> bool:
+        """False for a fit that has not converged, of so large a log that fits beside it would take minutes.
+
+        Its evidence is not that of an optimum, and decides nothing between explanations.
+        """
+        intervals = self.intervals
+        n_unknowns = len(intervals.augmented.unknowns)
+        return self.refinement.converged or len(intervals.measured) * intervals.substeps * n_unknowns < _LABORIOUS
 
     @cached_property
     def cost(self) -> float:
@@ -182,6 +194,8 @@ class LocalSearch:
         """The likeliest explanation so far after each stage of the search."""
         flexible = self._accurate(self._from_hypothesis(intervals))
         yield self._shown(flexible, 0.35)
+        if not flexible.is_comparable:
+            return
         if rival is not None and (ended := self._ended_by(rival, flexible)) is not None:
             yield self._shown(ended, 0.6)
             return

@@ -46,7 +46,7 @@ from diransac.identification.regression.rows import excited
 from diransac.identification.structure.columns import FITTED_MOTION
 from diransac.identification.structure.equivalents import equivalent_parameters, is_close
 from diransac.identification.structure.free_units import KnownUpTo, known_up_to_units
-from diransac.identification.structure.refusal import check_signs
+from diransac.identification.structure.refusal import check_drives, check_signs
 from diransac.identification.structure.structural import check_structure, structural, unidentifiable
 from diransac.process import memory_kept
 
@@ -203,6 +203,7 @@ def _fitted(settings: LoDiransac, dataset: Dataset, seed: int, callback: Callbac
     _check_names(settings, dataset)
     allowed = len(dataset.model.parameters) - 1
     check_structure(dataset.model, dataset.source, allowed, ranges=dataset.ranges)
+    check_drives(dataset)
     report(callback, "smoothing", 0.0)
     whole = prepared(settings, dataset)
     if unmeasured_states(whole[0]):

@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -173,7 +174,7 @@ class Candidates:
         """Number ``(K,)`` of the effect of which each term is a form."""
         return np.unique([x.parameter for x in self.library.terms], return_inverse=True)[1]
 
-    @property
+    @cached_property
     def _least(self) -> float:
         """Logarithm of the odds that no term has by the choice among all."""
         return _EVIDENCE + float(np.log(max(len(self.library), 1)))
@@ -190,9 +191,11 @@ class Candidates:
         alone, (pairs, white) = self.alone(), self._pairs()
         least = np.array([x.log_odds for x in alone])[pairs].max(axis=1, initial=self._least - _EVIDENCE) + self._least
         # What neighbouring intervals have in common leaves the largest part of its odds to the pair that explains most.
-        likely, part, most = list[TermSet](), 1.0, -np.inf
+        likely, part, most, fewest = list[TermSet](), 1.0, -np.inf, least.min(initial=np.inf)
         for i in np.argsort(-white, kind="stable"):
-            if part * white[i] > max(least[i], most - self._least):
+            if part * white[i] <= max(fewest, most - self._least):
+                break  # nor does one of the others, which explain less
+            if part * white[i] > least[i]:
                 pair = self._pair(pairs[i])
                 part = part if np.isfinite(most) else max(pair.log_odds / white[i], 0.0)
                 most = max(most, pair.log_odds)
@@ -242,7 +245,7 @@ class Candidates:
     def _is_possible(self, k: int, members: tuple[int, ...]) -> bool:
         """True for a coefficient within its bounds, and a force that is not negligible."""
         value, (low, high) = self.regression.joint(members)[0][members.index(k)], self.library.terms[k].bounds
-        share = self.regression.beside(*(x for x in members if x != k)).explained(k)
+        share = self.regression.explained(k, members)
         return bool(low < value < high and abs(value) > _SMALLEST * self.units[k] and share > _SHARE)
 
     def _rivals(self, k: int, members: tuple[int, ...]) -> tuple[int, ...]:
@@ -350,7 +353,7 @@ def missing_terms(candidates: Candidates) -> MissingTerms:
     chosen, first = [x.index for x in selected], [x.index for x in selected if x.members == selected[0].members]
     suggestions = []
     for term, value, error in zip(selected, *regression.joint(chosen), strict=True):
-        share = regression.beside(*(k for k in chosen if k != term.index)).explained(term.index)
+        share = regression.explained(term.index, chosen)
         suggestions.append(tests.library.suggestion(term.index, float(value), float(error), share, term.rivals))
     explained = regression.force - regression.beside(*chosen).force
     accelerations = np.linalg.solve(tests.inertia, explained[:, :, None])[:, :, 0]

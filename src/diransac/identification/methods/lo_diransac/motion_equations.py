@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from diransac.arrays import FloatArray, IntArray
+from diransac.identification.core.windows import discrepant_pairs
 from diransac.identification.methods.lo_diransac.smoothing import split_signals
 from diransac.simulation.compiler import compile_map
 
@@ -188,7 +189,8 @@ def discrepancy_units(intervals: Windows, motion: Motion, p: FloatArray) -> Floa
     force[force == 0.0] = 1.0  # nor do discrepancies of what is at rest
     level = np.append(1.0, np.sqrt(np.square(intervals.inputs).mean(axis=0)))
     level[level == 0.0] = 1.0  # the gain of an input that never acts stays at its prior
-    return np.concatenate([np.full(intervals.n_p, np.inf), (force[:, None] / level).ravel()])
+    equations, columns = np.array(discrepant_pairs(intervals.model)).T
+    return np.concatenate([np.full(intervals.n_p, np.inf), force[equations] / level[columns]])
 
 
 def parameter_units(intervals: Windows, motion: Motion, p: FloatArray) -> FloatArray:

@@ -29,6 +29,7 @@ from diransac.identification.methods.lo_diransac.unmeasured import (
     with_unmeasured_states,
 )
 from diransac.identification.regression.rows import MotionRows
+from diransac.identification.structure.prospects import Prospects
 from diransac.identification.structure.refusal import cause_of_refusal
 from diransac.time_limit import check_time
 
@@ -257,6 +258,12 @@ def _hypotheses(
         return found
     cause = cause_of_refusal(dataset.model, dataset.layout, rows_of_logs(intervals, motion))
     raise IdentificationError(f"{dataset.source}: no sample gives parameters within their bounds: {cause}")
+
+
+def prospects_of(dataset: Dataset, intervals: Windows, motion: Motion) -> Prospects:
+    """Prospects of a search by the smoothed motion; of no row where it lacks states that nothing measures."""
+    rows = [] if unmeasured_states(intervals) else rows_of_logs(intervals, motion)
+    return Prospects(dataset.model, dataset.layout, rows)
 
 
 def rows_of_logs(intervals: Windows, motion: Motion) -> list[MotionRows]:

@@ -44,7 +44,9 @@ ROUNDING = 1e-12
 # Numbers of the equations that are solved at once, at most: 80 MB, a tenth of a second.
 _NUMBERS = 1e7
 # Numbers of a section of more.
-_SECTION = 3e5
+_SECTION = 2e6
+# Rows of residuals, over their columns, of which a triangle is made at once: of fewer, it takes most of the time.
+_ROWS = 8
 # Factor of the prior of discrepancies, which stand for the forces of terms, that holds them at zero.
 _HELD = 1e-3
 
@@ -146,11 +148,16 @@ class TermRegression:
         divisor = self.divisor(self.effects[:, list(chosen)] @ values)
         return values / divisor, np.sqrt(np.diag(covariance)) / divisor
 
-    def explained(self, k: int) -> float:
-        """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts."""
-        acts, (value, _) = self.acts[:, k], self._along(k)
+    def explained(self, k: int, members: Sequence[int] = ()) -> float:
+        """Fraction of the mean square unmodelled force that effect k explains, in the equations where it acts.
+
+        Beside the others of a set of effects.
+        """
+        others = [x for x in members if x != k]
+        own = self.of([k, *others]).beside(*range(1, 1 + len(others)))
+        acts, (value, _) = own.acts[:, 0], own._along(0)
         before, after = (
-            np.square(x[:, acts]).sum(axis=0) for x in (self.force, self.force + self.forces[:, :, k] * value)
+            np.square(x[:, acts]).sum(axis=0) for x in (own.force, own.force + own.forces[:, :, 0] * value)
         )
         return float(1.0 - (after / size_or_one(before)).mean())
 
@@ -208,17 +215,22 @@ def term_regression(
     sections = _sections(len(intervals), parts, _numbers(fit, accelerations.shape[2]))
     direct, of_s = (np.sum(x, axis=0) for x in zip(*map(pushed.of_shared, sections), strict=True))
     windows, s = at.system.functional_in_sections(pushed.of_windows, np.column_stack([of_s, at.right_s]), sections)
-    rows, length = list[FloatArray](), 1 if len(sections) == 1 else round(np.sqrt(n))
+    rows, batches, length = list[FloatArray](), list[list[FloatArray]](), 1 if len(sections) == 1 else round(np.sqrt(n))
     effects, moved = result.of_s.T @ s[:, :-1], np.empty((n, inertia.shape[1], s.shape[1]))
     for part, (before, z, after) in zip(sections, _with_neighbours(windows), strict=True):
         own = slice(part.start // parts, part.stop // parts)
         found = pushed.residuals(part, z, before, after, s)
-        _gather(rows, found.reshape(-1, parts * found.shape[1], found.shape[2]), own.start, length)
+        found = found.reshape(-1, parts * found.shape[1], found.shape[2])
+        if length == 1:
+            rows.append(found)
+        else:
+            _gather(batches, found, own.start, length)
         # Of each interval of the estimate: the state at its start, and the mean unmodelled acceleration.
         z = z.reshape(-1, parts, *z.shape[1:])
         z = np.concatenate([z[:, 0, :n_x], z[:, :, n_x:].mean(axis=1)], axis=1)
         effects = effects + np.einsum("wkp,wke->pe", result.of_z[own], z[:, :, :-1], optimize=True)
         np.matmul(inertia[own], z[:, n_x:], out=moved[own])
+    rows += [_triangle(x)[None] for x in batches]
     d = fit.d.reshape(n, parts, -1).mean(axis=1)
     force = (inertia @ d[:, :, None])[:, :, 0] + moved[:, :, -1]
     beforehand = np.column_stack([s, fit.shared - fit.prior_mean]) / prior[:, None]
@@ -352,21 +364,22 @@ def _with_neighbours(sections: Iterator[FloatArray]) -> Iterator[tuple[FloatArra
         before, z = z[-1:], after
 
 
-def _gather(found: list[FloatArray], rows: FloatArray, first: int, length: int) -> None:
-    """Append residuals (n, m, c) of intervals from a first one on; of batches of more than one as few as there may be.
-
-    With the same squares and products: the triangle of a QR decomposition.
-    """
-    if length == 1:
-        found.append(rows)
-        return
+def _gather(batches: list[list[FloatArray]], rows: FloatArray, first: int, length: int) -> None:
+    """Append residuals (n, m, c) of intervals from a first one on to batches of a length, as the triangles of many."""
     c = rows.shape[2]
     for begin, end in pairwise([0, *range(-first % length or length, len(rows), length), len(rows)]):
-        piece = rows[begin:end].reshape(-1, c)
-        if (first + begin) % length:
-            piece = np.concatenate([found.pop()[0], piece])
-        triangle = np.linalg.qr(piece, mode="r")
-        found.append(np.pad(triangle, ((0, c - len(triangle)), (0, 0)))[None])
+        if (first + begin) % length == 0:
+            batches.append([])
+        pieces = batches[-1]
+        pieces.append(rows[begin:end].reshape(-1, c))
+        if sum(map(len, pieces)) > _ROWS * c:
+            pieces[:] = [_triangle(pieces)]
+
+
+def _triangle(pieces: Sequence[FloatArray]) -> FloatArray:
+    """Rows (c, c) with the squares and products of others (m, c): the triangle of a QR decomposition."""
+    found = np.asarray(np.linalg.qr(np.concatenate(pieces), mode="r"), float)
+    return np.pad(found, ((0, found.shape[1] - len(found)), (0, 0)))
 
 
 def _whitened(H: FloatArray, gradient: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
