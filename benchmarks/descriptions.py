@@ -19,7 +19,7 @@ import importlib.util
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,15 +41,15 @@ REASONS = {
     "nothing moves": "there are no joints",
     "closed loop": "closes a kinematic loop",
     "ball joint": "is a ball joint",
-    "tendon that exerts forces": "tendons with",
-    "fluid": "surrounding fluid",
+    "force without equations": "no equations here|not modelled|surrounding fluid",
     "no mass where something moves": "moves has a mass",
     "impossible inertia": "inertia must|mass and inertia of moving",
     "included file is missing": "Element 'include'",
     "file of a mesh is missing": r"[Ee]rror opening file|mesh file",
     "Xacro": "Xacro",
     "SDF": "SDF",
-    "too many joints": "joints, more than|split the robot",
+    "part of a file": "is a part that",
+    "too many joints": "split the robot",
     "ambiguous names": "names of joints differ only",
     "MuJoCo does not read the text": "cannot be read",
 }
@@ -73,7 +73,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER|FILE")
     parser.add_argument("--refusals", action="store_true", help="print the message of each refusal")
     chosen = parser.parse_args(arguments)
-    outcomes = {folder.name: list(outcomes_of(folder)) for folder in chosen.folders or installed()}
+    folders = chosen.folders or installed()
+    if not folders:
+        print(f"none of these packages is installed: {', '.join(PACKAGES)}; give folders")
+        return
+    outcomes = {folder.name: list(outcomes_of(folder)) for folder in folders}
     print_table(outcomes)
     print_unequal([x for own in outcomes.values() for x in own])
     print_refusals([x for own in outcomes.values() for x in own], every=chosen.refusals)
@@ -125,12 +129,10 @@ def reason_of(message: str) -> str:
 
 def reference(file: Path) -> tuple[Any, bool]:
     """MuJoCo's model of a file with its base held, and whether MuJoCo compiles the file as it is."""
-    readers: tuple[Callable[[str], Any], ...] = (mujoco.MjSpec.from_file, parsed)
-    for reader in readers:
+    for as_it_is in (True, False):
         with contextlib.suppress(ValueError):
-            spec = reader(str(file))
-            spec = getattr(spec, "spec", spec)
-            if reader is parsed:
+            spec = mujoco.MjSpec.from_file(str(file)) if as_it_is else parsed(file).spec
+            if not as_it_is:
                 drop_meshes(spec)
             for joint in [x for x in spec.joints if x.type == mujoco.mjtJoint.mjJNT_FREE]:
                 spec.delete(joint)
@@ -138,8 +140,11 @@ def reference(file: Path) -> tuple[Any, bool]:
                 spec.delete(key)
             spec.compiler.fusestatic = False  # MuJoCo drops the inertia of a massless body that it fuses
             compiled = spec.compile()
-            compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-            return compiled, reader is not parsed
+            bits = mujoco.mjtDisableBit
+            if compiled.opt.disableflags & (bits.mjDSBL_CONSTRAINT | bits.mjDSBL_EQUALITY):
+                compiled.eq_active0[:] = 0
+            compiled.opt.disableflags |= bits.mjDSBL_CONSTRAINT
+            return compiled, as_it_is
     raise RuntimeError(f"{file}: diransac reads what MuJoCo cannot compile")
 
 
