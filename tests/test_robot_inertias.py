@@ -141,7 +141,7 @@ def test_an_unknown_inertia_is_what_is_identified(described, inertia):
 @EVERY_INERTIA
 def test_strict_models_refuse_impossible_inertias_by_name(described, inertia):
     path = described(chain(link("first"), link("second", inertia)))
-    with pytest.raises(ModelError, match=r"no possible ones in the file: second \(.*name the bodies in bodies"):
+    with pytest.raises(ModelError, match=r"impossible or absent in the file: second \(.*name the bodies in bodies"):
         dr.models.robot(path, inertia="strict")
 
 
@@ -185,7 +185,7 @@ def test_a_link_without_a_mass_is_a_frame(described):
     expected = [inverse(reference, data, *motion) for motion in motions(2)]
     assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
     assert dr.models.robot(path).notes == ("bodies that move have no mass in the file, and add none: first",)
-    with pytest.raises(ModelError, match="no possible ones in the file: first"):
+    with pytest.raises(ModelError, match="impossible or absent in the file: first"):
         dr.models.robot(path, inertia="strict")
 
 
@@ -274,7 +274,7 @@ def test_notes_of_a_model_are_in_inspections_and_results(described, tmp_path):
     assert note in dr.Result.load(tmp_path / "arm.json").notes
     done = run(*words, "--inertia", "strict")
     assert done.exit_code == 1
-    assert "no possible ones in the file: first (it is zero)" in done.stderr
+    assert "impossible or absent in the file: first (it is zero)" in done.stderr
 
 
 # ---------------------------------------------------------------------- formats

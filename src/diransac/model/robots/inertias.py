@@ -226,8 +226,8 @@ def notes_on_inertias(
     if strict and matters:
         named = _listed(_named(description, matters))
         raise ModelError(
-            f"{label}: inertias of bodies that move are no possible ones in the file: {named}; correct them, name the "
-            'bodies in bodies, lock their joints, or give inertia="nearest"'
+            f"{label}: inertias of bodies that move are impossible or absent in the file: {named}; correct them, name "
+            'the bodies in bodies, lock their joints, or give inertia="nearest"'
         )
     irrelevant = {i: flaw for i, flaw in description.flaws.items() if i not in moving and flaw.kind == "impossible"}
     replaced = {i: flaw for i, flaw in description.flaws.items() if i in unknown and flaw.kind != "shapes"}
