@@ -336,12 +336,19 @@ def test_meshes_matter_only_where_they_give_an_inertia_of_what_moves(described):
 def test_tendons_without_force_may_wrap_shapes(described):
     text = """<mujoco><worldbody><site name="a"/><body name="arm" pos="0 0 1"><joint axis="0 1 0"/>
       <inertial pos="0 0 .1" mass="1" diaginertia="1 1 1"/><geom name="w" size=".1"/><site name="b" pos="0 0 1"/>
-      </body></worldbody><tendon><spatial><site site="a"/><geom geom="w"/><site site="b"/></spatial></tendon>
-      </mujoco>"""
+      </body></worldbody><tendon><spatial><site site="a"/><geom geom="w"/><site site="b"/><pulley divisor="2"/>
+      <site site="a"/><site site="b"/></spatial></tendon></mujoco>"""
     path = described(text, "tendon.xml")
     reference, data = compiled(path)
     expected = [inverse(reference, data, *motion) for motion in motions(1)]
     assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
+
+
+def test_a_tendon_of_a_joint_that_is_not_there_is_named(described):
+    text = """<mujoco><worldbody><body><joint/><geom size=".1"/></body></worldbody>
+      <tendon><fixed><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>"""
+    with pytest.raises(ModelError, match="joint 'elbow' not found in tendon"):
+        dr.models.robot(described(text, "tendon.xml"))
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous", "planar"])

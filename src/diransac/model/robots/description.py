@@ -402,7 +402,8 @@ def drop_shapes(spec: Any) -> None:
         element.material = ""
     _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.lights, spec.materials, spec.textures)
     spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE  # lengths of muscles, which MuJoCo simulates
-    wrapped = {x.target.name for tendon in spec.tendons for x in getattr(tendon, "path", ())}
+    path = [x.target for tendon in spec.tendons for x in getattr(tendon, "path", ())]
+    wrapped = {target.name for target in path if target is not None}  # of a pulley, or of what is not in the file
     _delete(spec, [shape for shape in spec.geoms if shape.name not in wrapped and not _counts(spec, shape)])
     needed = {name for shape in spec.geoms for name in (shape.meshname, shape.hfieldname)}
     _delete(spec, [x for x in (*spec.meshes, *spec.hfields) if x.name not in needed])
