@@ -128,16 +128,12 @@ def reason_of(message: str) -> str:
 
 
 def reference(file: Path) -> tuple[Any, bool]:
-    """MuJoCo's model of a file with its base held, and whether MuJoCo compiles the file as it is."""
+    """MuJoCo's model of a file, and whether MuJoCo compiles the file as it is."""
     for as_it_is in (True, False):
         with contextlib.suppress(ValueError):
             spec = mujoco.MjSpec.from_file(str(file)) if as_it_is else parsed(file).spec
             if not as_it_is:
                 drop_meshes(spec)
-            for joint in [x for x in spec.joints if x.type == mujoco.mjtJoint.mjJNT_FREE]:
-                spec.delete(joint)
-            for key in list(spec.keys):
-                spec.delete(key)
             spec.compiler.fusestatic = False  # MuJoCo drops the inertia of a massless body that it fuses
             compiled = spec.compile()
             bits = mujoco.mjtDisableBit
@@ -173,18 +169,19 @@ def difference(model: dr.Model, compiled: Any) -> float:
     p = [0.0 if name.startswith("friction") else x.value for name, x in model.parameters.items()]
     data, rng, errors = mujoco.MjData(compiled), np.random.default_rng(0), []
     followers = {int(compiled.eq_obj1id[k]): k for k in np.flatnonzero(compiled.eq_active0)}
-    leaders = [k for k in range(compiled.njnt) if k not in followers]
+    joints = np.flatnonzero(compiled.jnt_type != mujoco.mjtJoint.mjJNT_FREE)  # free bodies rest in the pose of the file
+    leaders = [k for k in joints.tolist() if k not in followers]
+    at, dofs = compiled.jnt_qposadr[joints], compiled.jnt_dofadr[joints]
     for _ in range(5):
         motion = np.zeros((3, compiled.njnt))
         motion[:, leaders] = rng.normal(size=(3, len(leaders)))
         slopes = np.eye(compiled.njnt)[:, leaders]
         for k, constraint in followers.items():
             motion[:, k], slopes[k] = followed(compiled, k, constraint, motion, slopes)
-        data.qpos[:], data.qvel[:], data.qacc[:] = motion
+        data.qpos[at], data.qvel[dofs], data.qacc[dofs] = motion[:, joints]
         mujoco.mj_inverse(compiled, data)
-        friction = np.zeros(compiled.njnt)  # of followers, which is no parameter
-        friction[list(followers)] = compiled.dof_frictionloss[list(followers)]
-        expected = slopes.T @ (data.qfrc_inverse + friction * np.tanh(motion[1] / 0.05))
+        friction = np.where(np.isin(joints, list(followers)), compiled.dof_frictionloss[dofs], 0.0)  # no parameter
+        expected = slopes[joints].T @ (data.qfrc_inverse[dofs] + friction * np.tanh(motion[1, joints] / 0.05))
         found = np.array(model.residual(*motion[:, leaders], np.zeros(model.n_u), p)).ravel()
         errors.append(np.abs(found - expected).max() / max(np.abs(expected).max(), 1e-12))
     return float(np.max(errors))
@@ -194,11 +191,12 @@ def followed(
     compiled: Any, k: int, constraint: int, motion: FloatArray, slopes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Position, velocity and acceleration of a joint that follows another, and its slopes; leaders come first."""
-    leader, y0 = int(compiled.eq_obj2id[constraint]), compiled.qpos0[k]
+    leader, rest = int(compiled.eq_obj2id[constraint]), compiled.qpos0[compiled.jnt_qposadr]
+    y0 = rest[k]
     polynomial = np.polynomial.Polynomial(compiled.eq_data[constraint, :5])
     if leader < 0:
         return np.array([y0 + polynomial(0.0), 0.0, 0.0]), 0.0 * slopes[k]
-    x, v, a = motion[:, leader] - np.array([compiled.qpos0[leader], 0.0, 0.0])
+    x, v, a = motion[:, leader] - np.array([rest[leader], 0.0, 0.0])
     slope, curvature = polynomial.deriv(1)(x), polynomial.deriv(2)(x)
     return np.array([y0 + polynomial(x), slope * v, slope * a + curvature * v**2]), slope * slopes[leader]
 
