@@ -211,6 +211,14 @@ def test_a_joint_that_moves_no_mass_is_named(described, second):
     assert list(dr.models.robot(path, bodies=["second"]).parameters) == list(other.parameters)
 
 
+def test_an_arm_without_any_mass_is_identified_where_its_bodies_are_unknown(described):
+    path = described(chain('<link name="first"/>', '<link name="second"/>'))
+    with pytest.raises(ModelError, match='nothing that joint "j0" moves has a mass'):
+        dr.models.robot(path)
+    other = dr.models.robot(described(chain(link("first"), link("second")), "good.urdf"), bodies="all")
+    assert list(dr.models.robot(path, bodies="all").parameters) == list(other.parameters)
+
+
 def test_the_mass_of_shapes_in_a_urdf_is_said(described):
     box = '<link name="first"><collision><geometry><box size=".1 .2 .3"/></geometry></collision></link>'
     path = described(chain(box))
