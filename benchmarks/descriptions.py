@@ -19,7 +19,7 @@ import importlib.util
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,15 +41,15 @@ REASONS = {
     "nothing moves": "there are no joints",
     "closed loop": "closes a kinematic loop",
     "ball joint": "is a ball joint",
-    "tendon that exerts forces": "tendons with",
-    "fluid": "surrounding fluid",
+    "force without equations": "no equations here|not modelled|surrounding fluid",
     "no mass where something moves": "moves has a mass",
     "impossible inertia": "inertia must|mass and inertia of moving",
     "included file is missing": "Element 'include'",
     "file of a mesh is missing": r"[Ee]rror opening file|mesh file",
     "Xacro": "Xacro",
     "SDF": "SDF",
-    "too many joints": "joints, more than|split the robot",
+    "part of a file": "is a part that",
+    "too many joints": "split the robot",
     "ambiguous names": "names of joints differ only",
     "MuJoCo does not read the text": "cannot be read",
 }
@@ -73,7 +73,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER|FILE")
     parser.add_argument("--refusals", action="store_true", help="print the message of each refusal")
     chosen = parser.parse_args(arguments)
-    outcomes = {folder.name: list(outcomes_of(folder)) for folder in chosen.folders or installed()}
+    folders = chosen.folders or installed()
+    if not folders:
+        print(f"none of these packages is installed: {', '.join(PACKAGES)}; give folders")
+        return
+    outcomes = {folder.name: list(outcomes_of(folder)) for folder in folders}
     print_table(outcomes)
     print_unequal([x for own in outcomes.values() for x in own])
     print_refusals([x for own in outcomes.values() for x in own], every=chosen.refusals)
@@ -124,30 +128,27 @@ def reason_of(message: str) -> str:
 
 
 def reference(file: Path) -> tuple[Any, bool]:
-    """MuJoCo's model of a file with its base held, and whether MuJoCo compiles the file as it is."""
-    readers: tuple[Callable[[str], Any], ...] = (mujoco.MjSpec.from_file, parsed)
-    for reader in readers:
+    """MuJoCo's model of a file, and whether MuJoCo compiles the file as it is."""
+    for as_it_is in (True, False):
         with contextlib.suppress(ValueError):
-            spec = reader(str(file))
-            spec = getattr(spec, "spec", spec)
-            if reader is parsed:
+            spec = mujoco.MjSpec.from_file(str(file)) if as_it_is else parsed(file).spec
+            if not as_it_is:
                 drop_meshes(spec)
-            for joint in [x for x in spec.joints if x.type == mujoco.mjtJoint.mjJNT_FREE]:
-                spec.delete(joint)
-            for key in list(spec.keys):
-                spec.delete(key)
             spec.compiler.fusestatic = False  # MuJoCo drops the inertia of a massless body that it fuses
             compiled = spec.compile()
-            compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-            return compiled, reader is not parsed
+            bits = mujoco.mjtDisableBit
+            if compiled.opt.disableflags & (bits.mjDSBL_CONSTRAINT | bits.mjDSBL_EQUALITY):
+                compiled.eq_active0[:] = 0
+            compiled.opt.disableflags |= bits.mjDSBL_CONSTRAINT
+            return compiled, as_it_is
     raise RuntimeError(f"{file}: diransac reads what MuJoCo cannot compile")
 
 
 def drop_meshes(spec: Any) -> None:
-    """Remove shapes of bodies with an inertial and what refers to them, so that files of meshes need not be there."""
+    """Remove shapes of bodies with an inertial, or that do not move: files of their meshes need not be there."""
     for element in (*spec.pairs, *spec.sensors, *spec.skins, *spec.lights, *spec.materials, *spec.textures):
         spec.delete(element)
-    for shape in [x for x in spec.geoms if x.parent.explicitinertial or not list(x.parent.joints)]:
+    for shape in [x for x in spec.geoms if x.parent.explicitinertial or not moves(x.parent)]:
         spec.delete(shape)
     for shape in (*spec.geoms, *spec.sites, *spec.tendons):
         shape.material = ""
@@ -156,23 +157,31 @@ def drop_meshes(spec: Any) -> None:
         spec.delete(mesh)
 
 
+def moves(body: Any) -> bool:
+    """Whether a body, or one that bears it, has a joint."""
+    while body.parent is not None and not list(body.joints):
+        body = body.parent
+    return body.parent is not None
+
+
 def difference(model: dr.Model, compiled: Any) -> float:
     """Largest difference of forces over the largest force, of five random motions."""
     p = [0.0 if name.startswith("friction") else x.value for name, x in model.parameters.items()]
     data, rng, errors = mujoco.MjData(compiled), np.random.default_rng(0), []
     followers = {int(compiled.eq_obj1id[k]): k for k in np.flatnonzero(compiled.eq_active0)}
-    leaders = [k for k in range(compiled.njnt) if k not in followers]
+    joints = np.flatnonzero(compiled.jnt_type != mujoco.mjtJoint.mjJNT_FREE)  # free bodies rest in the pose of the file
+    leaders = [k for k in joints.tolist() if k not in followers]
+    at, dofs = compiled.jnt_qposadr[joints], compiled.jnt_dofadr[joints]
     for _ in range(5):
         motion = np.zeros((3, compiled.njnt))
         motion[:, leaders] = rng.normal(size=(3, len(leaders)))
         slopes = np.eye(compiled.njnt)[:, leaders]
         for k, constraint in followers.items():
             motion[:, k], slopes[k] = followed(compiled, k, constraint, motion, slopes)
-        data.qpos[:], data.qvel[:], data.qacc[:] = motion
+        data.qpos[at], data.qvel[dofs], data.qacc[dofs] = motion[:, joints]
         mujoco.mj_inverse(compiled, data)
-        friction = np.zeros(compiled.njnt)  # of followers, which is no parameter
-        friction[list(followers)] = compiled.dof_frictionloss[list(followers)]
-        expected = slopes.T @ (data.qfrc_inverse + friction * np.tanh(motion[1] / 0.05))
+        friction = np.where(np.isin(joints, list(followers)), compiled.dof_frictionloss[dofs], 0.0)  # no parameter
+        expected = slopes[joints].T @ (data.qfrc_inverse[dofs] + friction * np.tanh(motion[1, joints] / 0.05))
         found = np.array(model.residual(*motion[:, leaders], np.zeros(model.n_u), p)).ravel()
         errors.append(np.abs(found - expected).max() / max(np.abs(expected).max(), 1e-12))
     return float(np.max(errors))
@@ -182,11 +191,12 @@ def followed(
     compiled: Any, k: int, constraint: int, motion: FloatArray, slopes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Position, velocity and acceleration of a joint that follows another, and its slopes; leaders come first."""
-    leader, y0 = int(compiled.eq_obj2id[constraint]), compiled.qpos0[k]
+    leader, rest = int(compiled.eq_obj2id[constraint]), compiled.qpos0[compiled.jnt_qposadr]
+    y0 = rest[k]
     polynomial = np.polynomial.Polynomial(compiled.eq_data[constraint, :5])
     if leader < 0:
         return np.array([y0 + polynomial(0.0), 0.0, 0.0]), 0.0 * slopes[k]
-    x, v, a = motion[:, leader] - np.array([compiled.qpos0[leader], 0.0, 0.0])
+    x, v, a = motion[:, leader] - np.array([rest[leader], 0.0, 0.0])
     slope, curvature = polynomial.deriv(1)(x), polynomial.deriv(2)(x)
     return np.array([y0 + polynomial(x), slope * v, slope * a + curvature * v**2]), slope * slopes[leader]
 

@@ -141,7 +141,7 @@ def test_an_unknown_inertia_is_what_is_identified(described, inertia):
 @EVERY_INERTIA
 def test_strict_models_refuse_impossible_inertias_by_name(described, inertia):
     path = described(chain(link("first"), link("second", inertia)))
-    with pytest.raises(ModelError, match=r"no possible ones in the file: second \(.*name the bodies in bodies"):
+    with pytest.raises(ModelError, match=r"impossible or absent in the file: second \(.*name the bodies in bodies"):
         dr.models.robot(path, inertia="strict")
 
 
@@ -185,8 +185,18 @@ def test_a_link_without_a_mass_is_a_frame(described):
     expected = [inverse(reference, data, *motion) for motion in motions(2)]
     assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
     assert dr.models.robot(path).notes == ("bodies that move have no mass in the file, and add none: first",)
-    with pytest.raises(ModelError, match="no possible ones in the file: first"):
+    with pytest.raises(ModelError, match="impossible or absent in the file: first"):
         dr.models.robot(path, inertia="strict")
+
+
+def test_a_link_without_a_mass_keeps_its_inertia(described):
+    path = described(chain(link("first", mass=0.0), link("second")))
+    text = chain(link("first", mass=0.0), link("second")).replace('<mass value="0.0"/>', '<mass value="1e-13"/>')
+    reference, data = compiled(described(text, "light.urdf"))
+    expected = [inverse(reference, data, *motion) for motion in motions(2)]
+    assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
+    alone = described(chain(link("first", mass=0.0)), "wheel.urdf")
+    assert forces(alone)[:, 0] == pytest.approx(GOOD[1] * motions(1)[:, 2, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -199,6 +209,14 @@ def test_a_joint_that_moves_no_mass_is_named(described, second):
     assert list(dr.models.robot(path, joints=["j0"]).coordinates) == ["j0"]
     other = dr.models.robot(described(chain(link("first"), link("second")), "good.urdf"), bodies=["second"])
     assert list(dr.models.robot(path, bodies=["second"]).parameters) == list(other.parameters)
+
+
+def test_an_arm_without_any_mass_is_identified_where_its_bodies_are_unknown(described):
+    path = described(chain('<link name="first"/>', '<link name="second"/>'))
+    with pytest.raises(ModelError, match='nothing that joint "j0" moves has a mass'):
+        dr.models.robot(path)
+    other = dr.models.robot(described(chain(link("first"), link("second")), "good.urdf"), bodies="all")
+    assert list(dr.models.robot(path, bodies="all").parameters) == list(other.parameters)
 
 
 def test_the_mass_of_shapes_in_a_urdf_is_said(described):
@@ -264,7 +282,7 @@ def test_notes_of_a_model_are_in_inspections_and_results(described, tmp_path):
     assert note in dr.Result.load(tmp_path / "arm.json").notes
     done = run(*words, "--inertia", "strict")
     assert done.exit_code == 1
-    assert "no possible ones in the file: first (it is zero)" in done.stderr
+    assert "impossible or absent in the file: first (it is zero)" in done.stderr
 
 
 # ---------------------------------------------------------------------- formats
@@ -276,6 +294,7 @@ def test_notes_of_a_model_are_in_inspections_and_results(described, tmp_path):
         ("arm.urdf.xacro", '<robot name="a"><xacro:leg/></robot>', "expand them: xacro arm.urdf.xacro > arm.urdf"),
         ("arm.urdf", '<robot name="a"><xacro:leg/></robot>', "expand them: xacro arm.urdf > arm-expanded.urdf"),
         ("arm.xacro", '<robot name="a"><link name="${n}"/></robot>', "expand them: xacro arm.xacro > arm.urdf"),
+        ("arm.urdf", '<robot name="a"><origin xyz="$(arg x) 0 0"/></robot>', "has macros of Xacro"),
         ("arm.sdf", '<sdf version="1.7"><model name="a"/></sdf>', "is SDF, which is not read here"),
         ("arm.xml", "<mujocoinclude><body/></mujocoinclude>", "give the file that includes it"),
     ],
@@ -287,6 +306,25 @@ def test_other_formats_are_refused_with_what_to_do(described, name, text, messag
     done = run("design", str(path), "-o", str(path.parent / "design.csv"))
     assert done.exit_code == 1
     assert message in done.stderr
+
+
+@pytest.mark.parametrize("name", ["arm.mjcf", "ARM.XML", "arm.xacro", "arm.urdf"])
+def test_files_are_read_whatever_their_ending(described, name):
+    expected = forces(described(chain(link("first")), "good.urdf"))
+    assert forces(described(chain(link("first")), name)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_inertials_of_urdf_may_be_incomplete(described):
+    inertial = '<inertial><origin xyz="0.01 0.02 -0.15"/><mass value="1.2"/></inertial>'
+    path = described(chain(f'<link name="first">{inertial}</link>', link("second")))
+    zero = described(chain(link("first", IMPOSSIBLE["zero"]), link("second")), "zero.urdf")
+    assert forces(path) == pytest.approx(forces(zero), abs=1e-12)
+    assert "nearest possible ones: first (it is zero)" in dr.models.robot(path).notes[0]
+    flywheel = link("first").replace('<mass value="1.2"/>', "")
+    assert (
+        "no mass in the file, and add none: first"
+        in dr.models.robot(described(chain(flywheel, link("second")))).notes[0]
+    )
 
 
 def test_meshes_matter_only_where_they_give_an_inertia_of_what_moves(described):
@@ -306,12 +344,19 @@ def test_meshes_matter_only_where_they_give_an_inertia_of_what_moves(described):
 def test_tendons_without_force_may_wrap_shapes(described):
     text = """<mujoco><worldbody><site name="a"/><body name="arm" pos="0 0 1"><joint axis="0 1 0"/>
       <inertial pos="0 0 .1" mass="1" diaginertia="1 1 1"/><geom name="w" size=".1"/><site name="b" pos="0 0 1"/>
-      </body></worldbody><tendon><spatial><site site="a"/><geom geom="w"/><site site="b"/></spatial></tendon>
-      </mujoco>"""
+      </body></worldbody><tendon><spatial><site site="a"/><geom geom="w"/><site site="b"/><pulley divisor="2"/>
+      <site site="a"/><site site="b"/></spatial></tendon></mujoco>"""
     path = described(text, "tendon.xml")
     reference, data = compiled(path)
     expected = [inverse(reference, data, *motion) for motion in motions(1)]
     assert forces(path) == pytest.approx(np.array(expected), abs=1e-12)
+
+
+def test_a_tendon_of_a_joint_that_is_not_there_is_named(described):
+    text = """<mujoco><worldbody><body><joint/><geom size=".1"/></body></worldbody>
+      <tendon><fixed><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>"""
+    with pytest.raises(ModelError, match="joint 'elbow' not found in tendon"):
+        dr.models.robot(described(text, "tendon.xml"))
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous", "planar"])

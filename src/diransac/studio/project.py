@@ -26,7 +26,7 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Text = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00\n\r]*$")]
 _Stretch = Annotated[list[_Number], Field(min_length=2, max_length=2)]
 _READING = ["mapping", "columns", "rate", "repair", "map", "scale", "resample", "unmeasured", "episodes"]
-_ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base"]
+_ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base", "inertia"]
 _STEPS = ["from", "until", "while", "leave-out", "unwrap", "despike", "shift"]
 _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
@@ -72,6 +72,7 @@ class Project(BaseModel):
     bodies: list[_Text] | None = None
     joints: _Text | None = None
     base: Literal["held", "measured"] | None = None
+    inertia: Literal["nearest", "strict"] | None = None
     method: _Text | None = None
     estimator: _Text | None = None
     seed: int | None = None
@@ -194,7 +195,9 @@ class Project(BaseModel):
             return []
         options = self.options
         if self.names_robot:
-            given: dict[str, Any] = {k: options[k] for k in ("unknown", "bodies", "joints", "base") if k in options}
+            given: dict[str, Any] = {
+                k: options[k] for k in ("unknown", "bodies", "joints", "base", "inertia") if k in options
+            }
             given |= {"bodies": "all"} if given.get("bodies") == ["all"] else {}
             kinds = (("control", "PositionControl"), ("motor", "MotorCurrents"))
             drive = "".join(f", actuation=dr.{kind}({_given(options[k])[2:]})" for k, kind in kinds if k in options)

@@ -223,15 +223,18 @@ def parsed(path: str | Path, text: str | None = None, thin: float = THIN) -> Par
     if not Path(path).is_file():
         raise ModelError(f"{label} does not exist; give an MJCF (.xml) or URDF file")
     check_description(Path(path), label)
-    own = outline(path)
+    source = Path(path).read_bytes() if text is None else text.encode()
+    own = outline(source)
     check_format(own, path, label)
+    content = own.completed(source)
+    is_read = text is None and content == source and Path(path).suffix in (".xml", ".urdf")  # by MuJoCo, by itself
     try:
         with without_warnings():
-            if text is None:
+            if is_read:
                 spec = mujoco.MjSpec.from_file(str(path))
             else:
-                name = f"{uuid4().hex}{Path(path).suffix}"  # of a file that is not there
-                spec = mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: text.encode()})
+                name = uuid4().hex + (".urdf" if own.root == "robot" else ".xml")  # of a file that is not there
+                spec = mujoco.MjSpec.from_file(str(Path(path).with_name(name)), include={name: content})
     except _FAILURES as error:
         raise _unreadable(path, error) from error
     return Parsed(spec, repair(spec, is_urdf=own.root == "robot", thin=thin), own)
@@ -399,7 +402,8 @@ def drop_shapes(spec: Any) -> None:
         element.material = ""
     _delete(spec, spec.pairs, spec.sensors, spec.keys, spec.skins, spec.lights, spec.materials, spec.textures)
     spec.compiler.LRopt.mode = mujoco.mjtLRMode.mjLRMODE_NONE  # lengths of muscles, which MuJoCo simulates
-    wrapped = {x.target.name for tendon in spec.tendons for x in getattr(tendon, "path", ())}
+    path = [x.target for tendon in spec.tendons for x in getattr(tendon, "path", ())]
+    wrapped = {target.name for target in path if target is not None}  # of a pulley, or of what is not in the file
     _delete(spec, [shape for shape in spec.geoms if shape.name not in wrapped and not _counts(spec, shape)])
     needed = {name for shape in spec.geoms for name in (shape.meshname, shape.hfieldname)}
     _delete(spec, [x for x in (*spec.meshes, *spec.hfields) if x.name not in needed])

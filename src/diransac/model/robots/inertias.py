@@ -158,10 +158,15 @@ def _set_inertia(body: Any, I: FloatArray) -> None:
 
 
 def without_placeholders(bodies: tuple[Body, ...], flaws: Mapping[int, Flaw]) -> tuple[Body, ...]:
-    """The bodies, of which those that move without a mass have none again."""
-    nothing = np.zeros((4, 4))
+    """The bodies, of which those that move without a mass have none again; an inertia remains."""
+
+    def without_mass(J: FloatArray) -> FloatArray:
+        second = J - np.outer(J[:, 3], J[:, 3]) / J[3, 3]
+        return np.where(np.abs(second) > 2.0 * _LEAST, second, 0.0)
+
     is_massless = [i in flaws and flaws[i].kind == "massless" for i in range(len(bodies))]
-    return tuple(replace(x, inertial=nothing) if m else x for x, m in zip(bodies, is_massless, strict=True))
+    zipped = zip(bodies, is_massless, strict=True)
+    return tuple(replace(x, inertial=without_mass(x.inertial)) if massless else x for x, massless in zipped)
 
 
 def with_unknown(description: Description, unknown: Collection[int]) -> Description:
@@ -221,8 +226,8 @@ def notes_on_inertias(
     if strict and matters:
         named = _listed(_named(description, matters))
         raise ModelError(
-            f"{label}: inertias of bodies that move are no possible ones in the file: {named}; correct them, name the "
-            'bodies in bodies, lock their joints, or give inertia="nearest"'
+            f"{label}: inertias of bodies that move are impossible or absent in the file: {named}; correct them, name "
+            'the bodies in bodies, lock their joints, or give inertia="nearest"'
         )
     irrelevant = {i: flaw for i, flaw in description.flaws.items() if i not in moving and flaw.kind == "impossible"}
     replaced = {i: flaw for i, flaw in description.flaws.items() if i in unknown and flaw.kind != "shapes"}
@@ -248,7 +253,8 @@ def notes_on_simulated(label: str, compiled: Any, flaws: Sequence[tuple[Any, Fla
     """
     for body, flaw in flaws:
         if flaw.kind == "massless" and compiled.body_subtreemass[body.id] <= _NO_MASS * compiled.nbody:
-            raise ModelError(f'{label}: nothing that body "{body.name}" carries has a mass; give it one in the file')
+            name = body.name or f"body{body.id}"
+            raise ModelError(f'{label}: nothing that body "{name}" carries has a mass; give it one in the file')
     named = {body.name: flaw for body, flaw in flaws if flaw.kind == "impossible" and compiled.body_weldid[body.id]}
     return (_REPLACED.format(_listed(named)),) if named else ()
 
@@ -268,8 +274,8 @@ def _listed(flaws: Mapping[str, Flaw]) -> str:
 
 
 def _check_masses(label: str, description: Description, moved: Collection[int], unknown: Collection[int]) -> None:
-    """Raise ModelError where nothing that a joint moves has a mass."""
-    carries = [x.inertial[3, 3] > 0.0 or i in unknown for i, x in enumerate(description.bodies)]
+    """Raise ModelError where nothing that a joint moves has a mass or an inertia."""
+    carries = [bool(x.inertial.any()) or i in unknown for i, x in enumerate(description.bodies)]
     for i, body in reversed(list(enumerate(description.bodies))):
         carries[body.parent] |= body.parent >= 0 and carries[i]
     for i, body in enumerate(description.bodies):

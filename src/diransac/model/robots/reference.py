@@ -54,6 +54,9 @@ def _differences(description: Description) -> tuple[FloatArray, float]:
     """Differences of forces from MuJoCo's, over random motions, and the largest force."""
     module, machine = mujoco_module(), copy.copy(description.compiled)
     machine.opt.gravity[:] = description.gravity
+    massless = [i + 1 for i, flaw in description.flaws.items() if flaw.kind == "massless"]
+    machine.body_mass[massless] = 0.0  # a placeholder, without which MuJoCo does not compile
+    machine.body_inertia[massless] = np.where(machine.body_inertia[massless] > 1e-13, machine.body_inertia[massless], 0)
     machine.opt.disableflags &= ~int(module.mjtDisableBit.mjDSBL_GRAVITY)
     machine.opt.disableflags |= int(module.mjtDisableBit.mjDSBL_CONSTRAINT)
     machine.opt.enableflags &= ~int(module.mjtEnableBit.mjENBL_INVDISCRETE)  # of its integrator, not of the forces

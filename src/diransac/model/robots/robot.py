@@ -109,13 +109,13 @@ def robot(
     if gravity is not None:
         description = replace(description, gravity=_vector(gravity, "gravity"))
     label = f'robot "{path}"'
-    check_forces(label, description)
     coordinates = _coordinates(label, description, joints)
     moved = set(coordinates.values())
     for coupling in ordered_couplings(label, description):
         moved |= {coupling.follower} if coupling.leader in moved else set()
     chosen = _bodies(description, bodies, moved)
     notes = notes_on_inertias(label, description, moved, chosen, strict=inertia == "strict")
+    check_forces(label, description)
     mechanism = Mechanism(
         label=label,
         description=with_unknown(description, chosen),
