@@ -296,6 +296,11 @@ CALF = '<joint name="FL_calf_joint"'
     [
         (END, f'{END}<equality><connect body1="FL_calf" body2="FR_calf" anchor="0 0 0"/></equality>', "kinematic loop"),
         (END, f'{END}<equality><weld name="tie" body1="FL_calf"/></equality>', r'"tie" \(weld\) closes'),
+        (
+            END,
+            f'<body name="hand" mocap="true"/>{END}<equality><weld body1="FL_calf" body2="hand"/></equality>',
+            'ties the robot to "hand", a mocap body',
+        ),
         (f'{CALF} axis="0 1 0"', f'{CALF} type="ball"', "ball joint; replace"),
         (
             END,

@@ -482,10 +482,11 @@ def _couplings(label: str, model: Any, moved: list[int]) -> Iterator[Coupling]:
     for k in np.flatnonzero(model.eq_active0):
         if model.eq_type[k] != mujoco.mjtEq.mjEQ_JOINT:
             kind = mujoco.mjtEq(model.eq_type[k]).name.removeprefix("mjEQ_").lower()
-            raise ModelError(
-                f'{label}: the equality constraint "{model.equality(k).name or k}" ({kind}) closes a kinematic loop, '
-                "and only chains and trees are modelled; cut the loop, or couple its joints by polynomials"
-            )
+            what = "closes a kinematic loop, and only chains and trees are modelled; cut the loop, or couple its joints"
+            ends = (model.eq_obj1id[k], model.eq_obj2id[k]) if model.eq_objtype[k] == mujoco.mjtObj.mjOBJ_BODY else ()
+            if moved_by_user := [model.body(i).name for i in ends if model.body_mocapid[i] >= 0]:
+                what = f'ties the robot to "{moved_by_user[0]}", a mocap body that a user moves; leave it out'
+            raise ModelError(f'{label}: the equality constraint "{model.equality(k).name or k}" ({kind}) {what}')
         follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
         own = None if leader < 0 else moved.index(leader)
         yield Coupling(moved.index(follower), own, tuple(model.eq_data[k, :5].tolist()))
