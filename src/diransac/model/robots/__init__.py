@@ -9,6 +9,7 @@ Begin with `robot.py`.
 | `description.py`, `inertias.py` | bodies and joints of a file, read by MuJoCo; inertias that no body can have |
 | `formats.py`, `sizes.py` | formats that are not read, and velocity limits; limits of a file's size |
 | `rigid_body.py`, `mechanism.py`, `actuation.py` | inverse dynamics; forces of joints; forces of drives |
+| `reference.py` | forces of the equations against those of MuJoCo |
 | `calibration.py`, `consistency.py` | estimates in the file; possible bodies for base parameters |
 | `fields.py` | attributes of elements, and the entries of MuJoCo's compiled model that they hold |
 | `document.py`, `written.py` | the file's text; a text that MuJoCo compiles to a given model |
