@@ -397,6 +397,10 @@ def outcome(seed: int, folder: Path) -> tuple[str, float]:
     except dr.DiransacError as error:
         reasons = [found[0] for reason in REASONS if (found := re.search(reason, str(error)))]
         return (reasons[0] if reasons else f"unnamed: {error}"), 0.0
+    try:
+        mujoco.MjModel.from_xml_path(str(path))
+    except ValueError:  # of a body that MuJoCo takes to be without a mass
+        return "read, not compiled by MuJoCo", 0.0
     largest = max(x for _, x in differences(path, model, base, seed))
     return ("equal" if largest < EQUAL else "wrong"), largest
 
@@ -423,7 +427,7 @@ def main() -> None:
     print("| trees | |")
     print("|--:|---|")
     for reason, count in found.most_common():
-        print(f"| {count} | {'equal' if reason == 'equal' else f'refused: {reason}'} |")
+        print(f"| {count} | {reason if reason.startswith(('equal', 'read')) else f'refused: {reason}'} |")
 
 
 if __name__ == "__main__":
