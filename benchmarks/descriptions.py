@@ -30,7 +30,7 @@ import numpy as np
 import diransac as dr
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
-from diransac.model.robots.description import parsed
+from diransac.model.robots.compiled import parsed
 
 PACKAGES = ("brax", "dm_control", "gymnasium", "gymnasium_robotics", "metaworld", "pybullet_data", "robosuite")
 """Packages whose files are read where no folder is given."""

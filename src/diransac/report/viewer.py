@@ -34,7 +34,7 @@ from diransac.errors import ResultError
 from diransac.identification.assessment.open_loop import simulate
 from diransac.identification.result import Result
 from diransac.model.mjcf import MujocoModel
-from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.compiled import mujoco_module
 from diransac.plain_text import one_line
 from diransac.report.rendering import encodable
 from diransac.report.runs import Entry, Run, simulate_all

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from diransac.arrays import BoolArray, FloatArray, IntArray, size_or_one
 from diransac.errors import SettingsError
 from diransac.model.mjcf.model import write
-from diransac.model.robots.description import mujoco_module, without_warnings
+from diransac.model.robots.compiled import mujoco_module, without_warnings
 from diransac.simulation.batch import (
     ClosedLoopBatch,
     GaussNewtonBatch,

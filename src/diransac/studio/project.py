@@ -26,7 +26,7 @@ _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Text = Annotated[str, Field(min_length=1, max_length=4096, pattern=r"^[^\x00\n\r]*$")]
 _Stretch = Annotated[list[_Number], Field(min_length=2, max_length=2)]
 _READING = ["mapping", "columns", "rate", "repair", "map", "scale", "resample", "unmeasured", "episodes"]
-_ROBOT = ["unknown", "control", "motor", "bodies", "joints", "base", "inertia"]
+_ROBOT = ["unknown", "control", "motor", "bodies", "joints", "passive", "base", "inertia"]
 _STEPS = ["from", "until", "while", "leave-out", "unwrap", "despike", "shift"]
 _SEARCH = [
     *("method", "estimator", "seed", "input-hold", "fix", "prior", "start", "horizon", "settings"),
@@ -71,6 +71,7 @@ class Project(BaseModel):
     motor: dict[_Text, _Number | _Text] = {}
     bodies: list[_Text] | None = None
     joints: _Text | None = None
+    passive: list[_Text] | None = None
     base: Literal["held", "measured"] | None = None
     inertia: Literal["nearest", "strict"] | None = None
     method: _Text | None = None
@@ -196,7 +197,7 @@ class Project(BaseModel):
         options = self.options
         if self.names_robot:
             given: dict[str, Any] = {
-                k: options[k] for k in ("unknown", "bodies", "joints", "base", "inertia") if k in options
+                k: options[k] for k in ("unknown", "bodies", "joints", "passive", "base", "inertia") if k in options
             }
             given |= {"bodies": "all"} if given.get("bodies") == ["all"] else {}
             kinds = (("control", "PositionControl"), ("motor", "MotorCurrents"))

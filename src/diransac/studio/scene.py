@@ -123,7 +123,7 @@ def _content(
 
 def _compiled(model: str, path: str | None, roots: list[str]) -> Any:
     """MuJoCo's model, with visual shapes; bodies without any are drawn as links."""
-    from diransac.model.robots.description import mujoco_module, parsed
+    from diransac.model.robots.compiled import mujoco_module, parsed
 
     mujoco = mujoco_module()
     if path is None:
@@ -210,7 +210,7 @@ def _shown_geoms(compiled: Any) -> list[int]:
 
 def _places(compiled: Any, chosen: list[int], values: Mapping[str, FloatArray], n: int) -> FloatArray:
     """Rotation matrices and positions ``(n, n_shapes, 12)``."""
-    from diransac.model.robots.description import mujoco_module
+    from diransac.model.robots.compiled import mujoco_module
 
     mujoco = mujoco_module()
     data, found = mujoco.MjData(compiled), np.empty((n, len(chosen), 12))

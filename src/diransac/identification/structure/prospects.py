@@ -90,7 +90,7 @@ class Prospects:
         return bool((worse & (found.residuals < _HOLDS)).any())
 
     def sentences(self) -> Iterator[str]:
-        """What will not work, each with its remedy, without stops."""
+        """Clauses on what will not work, each with its remedy."""
         found = self.solution
         if found is None or not found.has_known_terms:
             return
@@ -117,7 +117,7 @@ class Prospects:
         return some(f"{n} = {x:.4g} ± {error:.2g}" for n, x, error in numbers if n in names)
 
     def remedy(self, names: Sequence[str]) -> str:
-        """What to do about parameters outside of their bounds, as a clause."""
+        """Remedy of parameters outside of their bounds, as a clause."""
         inputs = listed(list(dict.fromkeys(x for n in names for x in self._inputs_of(n))))
         if inputs:
             multiply = "it multiplies" if len(names) == 1 else "they multiply"

@@ -11,8 +11,8 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.mjcf.model import write
+from diransac.model.robots.compiled import compiled_file
 from diransac.model.robots.consistency import consistent_parameters
-from diransac.model.robots.description import compiled_file
 from diransac.model.robots.document import Document, numbers
 from diransac.model.robots.fields import Place, fields_of, names_of, places_of
 from diransac.model.robots.sizes import check_description

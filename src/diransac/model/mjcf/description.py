@@ -10,7 +10,7 @@ import numpy as np
 
 from diransac.errors import ModelError
 from diransac.model.robots.actuation import JointTorques, MotorCurrents, PositionControl
-from diransac.model.robots.description import further_states, mujoco_module, parsed, without_warnings
+from diransac.model.robots.compiled import further_states, mujoco_module, parsed, without_warnings
 from diransac.model.robots.document import Document
 from diransac.model.robots.inertias import THIN_IN_TEXT, notes_on_simulated
 from diransac.model.robots.mechanism import identifier

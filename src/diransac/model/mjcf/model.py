@@ -24,7 +24,7 @@ from diransac.model.mjcf.description import (
 from diransac.model.mjcf.masks import Unknown, unknowns_of
 from diransac.model.model import Model
 from diransac.model.parameter import Parameter
-from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.compiled import mujoco_module
 from diransac.model.robots.fields import ARRAYS, Place
 from diransac.model.robots.mechanism import identifier
 from diransac.model.robots.sizes import check_text

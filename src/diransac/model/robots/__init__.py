@@ -6,7 +6,8 @@ Begin with `robot.py`.
 | file | contents |
 |---|---|
 | `robot.py` | `robot` |
-| `description.py`, `inertias.py` | bodies and joints of a file, read by MuJoCo; inertias that no body can have |
+| `compiled.py`, `inertias.py` | files in MuJoCo, read and compiled; inertias that no body can have |
+| `description.py` | bodies and joints of a compiled file |
 | `formats.py`, `sizes.py` | formats that are not read, and velocity limits; limits of a file's size |
 | `rigid_body.py`, `mechanism.py`, `actuation.py` | inverse dynamics; forces of joints; forces of drives |
 | `reference.py` | forces of the equations against those of MuJoCo |

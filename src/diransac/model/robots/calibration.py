@@ -11,8 +11,9 @@ import numpy as np
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
 from diransac.model.parameter import Parameter
+from diransac.model.robots.compiled import compiled_file, mujoco_module
 from diransac.model.robots.consistency import consistent_parameters, inconsistency
-from diransac.model.robots.description import Description, Joint, compiled_file, mujoco_module, read_description
+from diransac.model.robots.description import Description, Joint, read_description
 from diransac.model.robots.document import Document
 from diransac.model.robots.fields import FIELDS, places_of
 from diransac.model.robots.inertias import with_unknown

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from diransac.model.robots.description import mujoco_module
+from diransac.model.robots.compiled import mujoco_module
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ _REMEDIES = {
 
 @dataclass
 class Outline:
-    """What the text of a description says of itself.
+    """Format of a description, and what MuJoCo does not read of its text.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ _DENSITY = 1000.0
 
 @dataclass(frozen=True)
 class Flaw:
-    """What a file lacks of the inertia of a body.
+    """Defect of the inertia of a body in a file.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def repair(spec: Any, *, is_urdf: bool, thin: float = THIN) -> list[tuple[Any, F
 
 
 def gives_inertia(spec: Any, shape: Any) -> bool:
-    """Whether a shape has a mass, which a body without an inertial takes over."""
+    """True if a shape has a mass, which a body without an inertial takes over."""
     low, high = spec.compiler.inertiagrouprange
     is_flat = shape.type.name in ("mjGEOM_PLANE", "mjGEOM_HFIELD")
     mass = shape.density if np.isnan(shape.mass) else shape.mass
@@ -96,14 +96,14 @@ def gives_inertia(spec: Any, shape: Any) -> bool:
 
 
 def _is_of_shapes(spec: Any, body: Any) -> bool:
-    """Whether MuJoCo infers the inertia of a body from its shapes."""
+    """True if MuJoCo infers the inertia of a body from its shapes."""
     rule = spec.compiler.inertiafromgeom.name.removeprefix("mjINERTIAFROMGEOM_")
     infers = rule == "TRUE" or (rule == "AUTO" and not body.explicitinertial)
     return infers and any(gives_inertia(spec, shape) for shape in body.geoms)
 
 
 def _carries_mass(spec: Any, body: Any) -> bool:
-    """Whether a body, or one that is welded to it, has a mass."""
+    """True if a body, or one that is welded to it, has a mass."""
     has_own = _is_of_shapes(spec, body) or (body.explicitinertial and body.mass > 0.0) or spec.compiler.boundmass > 0.0
     return has_own or any(_carries_mass(spec, x) for x in body.bodies if not list(x.joints))
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
-from diransac.model.robots.description import Description, described, moved_joints, mujoco_module
+from diransac.model.robots.compiled import mujoco_module
+from diransac.model.robots.description import Description, described, moved_joints
 from diransac.model.robots.mechanism import Mechanism
 
 _KINDS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", "actuator": "actuator"}

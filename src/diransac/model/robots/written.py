@@ -14,7 +14,7 @@ import numpy as np
 
 from diransac.arrays import FloatArray
 from diransac.errors import ModelError
-from diransac.model.robots.description import compiled_file, mujoco_module
+from diransac.model.robots.compiled import compiled_file, mujoco_module
 from diransac.model.robots.document import Document, Element, attributes, numbers
 from diransac.model.robots.fields import (
     ACTUATORS,
@@ -160,7 +160,7 @@ def with_inertials(document: Document, compiled: Any) -> str:
 
 
 class _Writer:
-    """What is written into a text.
+    """Changes of a text, by entries of the model that it is to compile to.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ export const model = (root, now) => {
     h("p.how", "Choose the equations whose parameters are to be identified."),
     h(".columns", h("div", list), h("div", about, code, place, equations)),
   );
-  const others = { unknown: null, bodies: null, base: null, inertia: null, joints: null, control: {}, motor: {} };
+  const others = { unknown: null, bodies: null, base: null, inertia: null, joints: null, passive: null, control: {}, motor: {} };
   const pick = (name) => change({ model: name, fix: {}, ...others });
   const entries = (title, names) =>
     names.length > 0 && [
